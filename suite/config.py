@@ -1,0 +1,245 @@
+"""Every hyperparameter, typed and frozen. The defaults are the paper's for Craftax-classic (its Appendix A).
+
+A run's configuration is built by `suite.registry.resolve`: these defaults, then the preset's changes for the task,
+then the agent's, then the user's `dotted.name=value`. Nothing else sets a hyperparameter.
+
+N_env, T_env and the like in the comments are the paper's names; "note n" is a row of the fidelity notes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+Positive = Annotated[int, Field(gt=0)]
+NotNegative = Annotated[int, Field(ge=0)]
+PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Rate = Annotated[float, Field(ge=0, lt=1)]
+ComputeType = Literal["auto", "float32", "bfloat16"]  # auto: bfloat16 on an accelerator, float32 on a CPU
+
+# `validate_default` so that a wrong number in this file fails at import, not in a run.
+config_class = dataclass(frozen=True, config=ConfigDict(extra="forbid", validate_default=True))
+
+
+@config_class
+class ProtocolConfig:
+    """What makes two results comparable: budget and scoring window. Hashed into every record."""
+
+    steps: Positive = 1_000_000  # T_total: real environment steps
+    final_fraction: Fraction = 0.1  # reward is the mean over episodes that end in this last part (note 29)
+
+
+@config_class
+class EnvironmentConfig:
+    """Collecting real experience (Algorithm 1, step 1)."""
+
+    num_envs: Positive = 48  # N_env
+    rollout_length: Positive = 96  # T_env
+    burn_in: NotNegative = 5  # M: frames that refresh the GRU before a rollout
+    # Where burn-in starts from in the real environment: the state carried over from M frames ago, or zero (note 12).
+    burn_in_start: Literal["carried", "zero"] = "carried"
+
+
+@config_class
+class PolicyConfig:
+    """Actor-critic network (Appendix A.1.1; sizes as the fidelity notes' parameter table)."""
+
+    kind: Literal["actor_critic", "uniform"] = "actor_critic"
+    cnn_channels: tuple[Positive, ...] = (64, 128, 128)  # one Impala stack each; the literal text: (64, 64, 128)
+    blocks_per_stack: Positive = 2
+    convs_per_block: Positive = 2  # the literal text: 1
+    cnn_norm: Literal["instance", "batch", "layer"] = "instance"  # note 1
+    activation: Literal["relu", "swish"] = "relu"  # inside the CNN
+    rnn_size: NotNegative = 256  # 0: no memory
+    hidden_size: Positive = 2048
+    dense_blocks: NotNegative = 2
+    shared_trunk: bool = False  # actor and critic share everything up to their last linear layers
+    compute_type: ComputeType = "auto"
+
+
+@config_class
+class PPOConfig:
+    """PPO on real and imagined play (Appendix A.1.2, Algorithm 3)."""
+
+    discount: Rate = 0.925  # gamma
+    gae_lambda: Fraction = 0.625
+    clip: PositiveFloat = 0.2  # epsilon
+    value_coefficient: NotNegativeFloat = 1.0  # lambda_TD (note 7)
+    entropy_coefficient: NotNegativeFloat = 0.01  # lambda_ent, on real play
+    target_decay: Rate = 0.95  # alpha: moving averages that standardise the value targets (note 8)
+    target_min_std: PositiveFloat = 0.1
+    learning_rate: PositiveFloat = 4.5e-4
+    anneal_learning_rate: bool = False  # linear to 0 over the budget: MFRL only (note 11)
+    adam_eps: PositiveFloat = 1e-5
+    max_grad_norm: PositiveFloat = 0.5
+    learn_from_real: bool = True  # Algorithm 1, step 2
+    epochs: Positive = 4  # on real play
+    minibatches: Positive = 8  # on real play: contiguous groups of environments
+
+
+@config_class
+class ReplayConfig:
+    """Buffer of real frames."""
+
+    capacity: Positive = 128_000  # frames over all environments
+
+
+@config_class
+class TokenizerConfig:
+    """From observations to tokens (Section 3.5, Appendix A.2.1)."""
+
+    kind: Literal["nearest_neighbor"] = "nearest_neighbor"
+    codebook_size: Positive = 4096  # K
+    threshold: NotNegativeFloat = 0.75  # tau, on the squared distance of patches in [0, 1] (note 13)
+    patch: tuple[Positive, Positive] | None = None  # None: the task's natural patch
+    updates: NotNegative = 25  # N_tok, each of `world_model.minibatches` minibatches
+
+
+@config_class
+class WorldModelConfig:
+    """Transformer world model (Section 3.6, Appendix A.2.2)."""
+
+    enabled: bool = True
+    block_teacher_forcing: Literal[True] = True  # BTF; the autoregressive mask belongs to M1 to M4
+    sequence_length: Positive = 20  # T_WM: blocks per training sequence, and keys kept in imagination
+    embed_dim: Positive = 128
+    layers: Positive = 3
+    heads: Positive = 8
+    dropout: Rate = 0.1  # embedding, attention and residual
+    positions: Literal["flat", "grid"] = "flat"  # RoPE over the token index, or over (time, row, column): note 20
+    reward_classes: tuple[float, ...] | None = None  # None: the task's levels
+    mask_after_done: bool = False  # drop losses after an episode's end inside a sequence: note 21
+    sequences: Positive = 48  # per update, over all minibatches (N_env in Algorithm 5)
+    updates: NotNegative = 500  # N_TWM
+    minibatches: Positive = 3
+    reward_weight: NotNegativeFloat = 1.0  # of the reward and termination losses (MinAtar: 10)
+    learning_rate: PositiveFloat = 1e-3
+    adam_eps: PositiveFloat = 1e-5
+    max_grad_norm: PositiveFloat = 0.5
+    compute_type: ComputeType = "auto"
+
+
+@config_class
+class ImaginationConfig:
+    """Policy updates on imagined play (Algorithm 1, step 4)."""
+
+    start_step: NotNegative = 200_000  # T_BP: warmup
+    horizon: Positive = 20  # T_WM
+    num_envs: Positive = 48
+    updates: NotNegative = 150  # N_AC, per iteration
+    schedule: Literal["constant", "linear"] = "constant"  # linear: 0 at step 0 to `updates` at the budget (Appendix C)
+    epochs: Positive = 1
+    minibatches: Positive = 1
+    entropy_coefficient: NotNegativeFloat = 0.01
+
+
+@config_class
+class CheckpointConfig:
+    """How often a run saves itself. Not part of the protocol."""
+
+    every_steps: Positive = 50_000
+    keep: Annotated[int, Field(ge=2)] = 2  # two, so that one may be found broken
+
+
+@config_class
+class Config:
+    """One run, completely."""
+
+    task: str
+    agent: str
+    preset: str
+    seed: NotNegative = 0
+    protocol: ProtocolConfig = ProtocolConfig()
+    environment: EnvironmentConfig = EnvironmentConfig()
+    policy: PolicyConfig = PolicyConfig()
+    ppo: PPOConfig = PPOConfig()
+    replay: ReplayConfig = ReplayConfig()
+    tokenizer: TokenizerConfig = TokenizerConfig()
+    world_model: WorldModelConfig = WorldModelConfig()
+    imagination: ImaginationConfig = ImaginationConfig()
+    checkpoint: CheckpointConfig = CheckpointConfig()
+
+    def __post_init__(self) -> None:
+        for problem in _problems(self):
+            raise ValueError(problem)
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Real environment steps of one iteration: N_env x T_env."""
+        return self.environment.num_envs * self.environment.rollout_length
+
+    @property
+    def iterations(self) -> int:
+        """Whole iterations that fit the budget: 1M / (48 x 96) = 217 (note 25)."""
+        return self.protocol.steps // self.steps_per_iteration
+
+    @property
+    def total_steps(self) -> int:
+        """Real steps actually taken: `iterations * steps_per_iteration`, at most the budget."""
+        return self.iterations * self.steps_per_iteration
+
+    def imagined_updates(self, steps: int) -> int:
+        """Imagined policy updates of the iteration that brings the run to `steps` real steps."""
+        plan = self.imagination
+        if not self.world_model.enabled or steps < plan.start_step:
+            return 0
+        if plan.schedule == "linear":
+            return round(plan.updates * min(1.0, steps / self.protocol.steps))
+        return plan.updates
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain nested values, as written to `config.json`."""
+        return json.loads(json.dumps(dataclasses.asdict(self)))
+
+    def digest(self) -> str:
+        """Identifies a run up to what may change without changing its results (checkpoint intervals)."""
+        fields = self.as_dict()
+        del fields["checkpoint"]
+        return hash_of(fields)
+
+
+def hash_of(fields: dict[str, Any]) -> str:
+    """First 16 hex digits of the SHA-256 of sorted JSON."""
+    return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _problems(config: Config):
+    """What no single field can say: sizes that must divide each other. Yields one line each."""
+    env, ppo, model, dream = config.environment, config.ppo, config.world_model, config.imagination
+    pairs = [
+        ("ppo.minibatches", ppo.minibatches, "environment.num_envs", env.num_envs),
+        ("imagination.minibatches", dream.minibatches, "imagination.num_envs", dream.num_envs),
+        ("world_model.minibatches", model.minibatches, "world_model.sequences", model.sequences),
+        ("world_model.heads", model.heads, "world_model.embed_dim", model.embed_dim),
+    ]
+    for name, value, of, total in pairs:
+        if total % value:
+            yield f"{name}={value} must divide {of}={total}"
+    if model.enabled and config.replay.capacity < 2 * config.steps_per_iteration:
+        yield f"replay.capacity={config.replay.capacity} must hold two iterations ({2 * config.steps_per_iteration})"
+    if model.enabled and env.rollout_length <= model.sequence_length:
+        yield (
+            f"environment.rollout_length={env.rollout_length} must exceed "
+            f"world_model.sequence_length={model.sequence_length}"
+        )
+    if model.enabled and env.rollout_length <= env.burn_in:
+        yield f"environment.rollout_length={env.rollout_length} must exceed environment.burn_in={env.burn_in}"
+    if dream.horizon > model.sequence_length:
+        yield (
+            f"imagination.horizon={dream.horizon} must not exceed "
+            f"world_model.sequence_length={model.sequence_length}, the longest context the model has seen"
+        )
+    if (model.embed_dim // model.heads) % 2:
+        yield f"world_model.embed_dim / world_model.heads = {model.embed_dim / model.heads:g} must be even (RoPE)"
+    if config.protocol.steps < config.steps_per_iteration:
+        yield (
+            f"protocol.steps={config.protocol.steps} is less than one iteration of "
+            f"{config.steps_per_iteration} steps ({env.num_envs} environments x {env.rollout_length})"
+        )

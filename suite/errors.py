@@ -1,0 +1,23 @@
+"""The two ways a command can fail that are not bugs. `suite.cli` turns both into one line on stderr."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(Exception):
+    """Bad input: one line that says what was wrong and what would be right. Exit code 2."""
+
+
+class RunError(Exception):
+    """A run that cannot go on (diverged loss, full disk): one line. Exit code 1; the last checkpoint stays."""
+
+
+def did_you_mean(word: str, valid: Iterable[str]) -> str:
+    """A clause that names the nearest valid word, or lists the valid ones when none is near."""
+    choices = sorted(valid)
+    near = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
+    if near:
+        return f"did you mean {near[0]!r}?"
+    return f"valid: {', '.join(choices)}"

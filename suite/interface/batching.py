@@ -1,0 +1,57 @@
+"""B environments side by side, with exact auto-reset.
+
+Exact: only an environment whose episode ended is reset, each with a world of its own. Under `vmap` a
+conditional becomes a select that would generate B worlds at every step; here a loop runs once per ended
+environment, so the cost of a reset is paid when there is one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from suite.interface.environment import Environment, EnvironmentSpec, State, TimeStep
+
+
+@dataclasses.dataclass(frozen=True)
+class Batched:
+    """`num_envs` copies of a pure environment as one `BatchedEnvironment`.
+
+    Randomness, so that a manual reset can reproduce ours: `reset(key)` gives environment i the key
+    `split(key, B)[i]`; `step(key, ...)` splits into `split(key, (2, B))`: row 0 steps, row 1 resets.
+    """
+
+    environment: Environment
+    num_envs: int
+
+    @property
+    def spec(self) -> EnvironmentSpec:
+        return self.environment.spec
+
+    def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
+        """B fresh episodes; every array leads with B."""
+        return jax.vmap(self.environment.reset)(jax.random.split(key, self.num_envs))
+
+    def step(self, key: jax.Array, state: State, action_B: jax.Array) -> tuple[State, TimeStep]:
+        """One step of each environment; those that ended continue at the first frame of a new episode.
+
+        The returned reward, flags, `final_observation` and statistics are of the step; `observation`, `first`
+        and `turn` are those of the new episode where one began.
+        """
+        step_keys_B, reset_keys_B = jax.random.split(key, (2, self.num_envs))
+        state, stepped = jax.vmap(self.environment.step)(step_keys_B, state, action_B)
+        ended_B = stepped.terminated | stepped.truncated
+        # Indices of the environments that ended come first; the loop visits only those.
+        order_B = jnp.argsort(~ended_B, stable=True)
+        shown = {"observation": stepped.observation, "turn": stepped.turn}
+
+        def reset_one(i, carry):
+            index = order_B[i]
+            fresh_state, fresh = self.environment.reset(reset_keys_B[index])
+            fresh_shown = {"observation": fresh.observation, "turn": fresh.turn}
+            return jax.tree.map(lambda old, new: old.at[index].set(new), carry, (fresh_state, fresh_shown))
+
+        state, shown = jax.lax.fori_loop(0, ended_B.sum(), reset_one, (state, shown))
+        return state, stepped.replace(first=ended_B, **shown)
