@@ -229,8 +229,8 @@ def _problems(config: Config):
             f"environment.rollout_length={env.rollout_length} must exceed "
             f"world_model.sequence_length={model.sequence_length}"
         )
-    if model.enabled and env.rollout_length <= env.burn_in:
-        yield f"environment.rollout_length={env.rollout_length} must exceed environment.burn_in={env.burn_in}"
+    if env.rollout_length < env.burn_in:
+        yield f"environment.rollout_length={env.rollout_length} must be at least environment.burn_in={env.burn_in}"
     if dream.horizon > model.sequence_length:
         yield (
             f"imagination.horizon={dream.horizon} must not exceed "

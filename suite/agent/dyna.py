@@ -1,0 +1,252 @@
+"""Algorithm 1: an agent that learns from real and imagined play. All the wiring, in one file.
+
+Each phase is one compiled function over donated state, with its loop inside; only metrics return to the host. The
+state is one pytree of arrays, so that several seeds can become its leading axis. `suite.run` calls the phases.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx, struct
+
+from suite.agent import rollout as play
+from suite.agent.replay import Replay, ReplayState
+from suite.config import Config
+from suite.interface.batching import Batched
+from suite.interface.environment import Environment, EnvironmentSpec
+from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec
+from suite.policy import ppo
+from suite.policy.actor_critic import make_policy
+from suite.tokenizers import make_tokenizer
+from suite.world_model import training as world_model_training
+from suite.world_model.imagination import Dream
+from suite.world_model.transformer import WorldModel
+
+Metrics = dict[str, jax.Array]
+
+
+@struct.dataclass
+class TrainState:
+    """Everything that a run carries from one iteration to the next.
+
+    Attributes:
+      learner: policy parameters, their optimizer, value statistics.
+      player: the real environments and the policy's memory of them.
+      replay, tokenizer, world_model: None for model-free agents.
+    """
+
+    learner: ppo.Learner
+    player: play.Player
+    replay: ReplayState | None = None
+    tokenizer: TokenizerState | None = None
+    world_model: world_model_training.WorldModelLearner | None = None
+
+
+def build_tokenizer(config: Config, spec: EnvironmentSpec) -> tuple[Tokenizer, TokenSpec, tuple[int, int] | None]:
+    """The tokenizer, the token stream it makes for the world model, and the patches' (rows, columns)."""
+    tokenizer = make_tokenizer(config.tokenizer, spec.observation)
+    tokens = TokenSpec(
+        tokens_per_frame=tokenizer.tokens_per_frame,
+        num_codes=tokenizer.num_codes,
+        num_actions=spec.num_actions,
+        reward_classes=config.world_model.reward_classes or spec.reward_classes,
+    )
+    return tokenizer, tokens, tokenizer.grid
+
+
+class Agent:
+    """One agent on one task: the static parts (networks' structure, optimizers), and the compiled phases."""
+
+    def __init__(self, config: Config, environment: Environment):
+        """Builds the structure only; `init` makes the arrays.
+
+        Args:
+          config: the resolved configuration.
+          environment: one pure environment.
+        """
+        self.config = config
+        self.spec = spec = environment.spec
+        self.batched = Batched(environment, config.environment.num_envs)
+        self.policy_graph = nnx.graphdef(nnx.eval_shape(lambda: self._new_policy(nnx.Rngs(0))))
+        updates = config.iterations * config.ppo.epochs * config.ppo.minibatches
+        self.policy_optimizer = ppo.make_optimizer(config.ppo, updates if config.ppo.anneal_learning_rate else None)
+        if config.world_model.enabled:
+            self.replay = Replay.of(config)
+            self.tokenizer, self.tokens, self.grid = build_tokenizer(config, spec)
+            self.world_model_optimizer = world_model_training.make_optimizer(config.world_model)
+            self.world_model_graph = nnx.graphdef(nnx.eval_shape(lambda: self._new_world_model(nnx.Rngs(0))))
+
+    def _new_policy(self, rngs: nnx.Rngs) -> Any:
+        return make_policy(self.config.policy, self.spec.observation, self.spec.num_actions, rngs)
+
+    def _new_world_model(self, rngs: nnx.Rngs) -> WorldModel:
+        return WorldModel(self.config.world_model, self.tokens, self.grid, rngs)
+
+    def _policy(self, learner: ppo.Learner) -> Any:
+        return nnx.merge(self.policy_graph, learner.params)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def init(self, key: jax.Array) -> TrainState:
+        """A fresh agent in fresh environments."""
+        policy_key, player_key, tokenizer_key, model_key = jax.random.split(key, 4)
+        policy = self._new_policy(nnx.Rngs(policy_key))
+        params = nnx.state(policy)
+        learner = ppo.Learner(
+            params=params, optimizer=self.policy_optimizer.init(params), targets=ppo.TargetStatistics.init()
+        )
+        state = TrainState(learner=learner, player=self._start(policy, player_key))
+        if not self.config.world_model.enabled:
+            return state
+        model_params = nnx.state(self._new_world_model(nnx.Rngs(model_key)))
+        return state.replace(
+            replay=self.replay.init(self.spec),
+            tokenizer=self.tokenizer.init(tokenizer_key),
+            world_model=world_model_training.WorldModelLearner(
+                params=model_params, optimizer=self.world_model_optimizer.init(model_params)
+            ),
+        )
+
+    def _start(self, policy: Any, key: jax.Array) -> play.Player:
+        return play.start(policy, self.batched, key, self.config.environment.burn_in)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def start(self, learner: ppo.Learner, key: jax.Array) -> play.Player:
+        """A player in fresh environments, for evaluation."""
+        return self._start(self._policy(learner), key)
+
+    @functools.partial(jax.jit, static_argnums=0, donate_argnums=2)
+    def collect(
+        self, learner: ppo.Learner, player: play.Player, key: jax.Array
+    ) -> tuple[play.Player, ppo.Trajectory, play.EpisodeLog]:
+        """Step 1: T_env real steps in each of N_env environments."""
+        config, policy = self.config.environment, self._policy(learner)
+        player = play.refresh(policy, player, carried=config.burn_in_start == "carried")
+        return play.rollout(key, policy, learner.targets, self.batched, player, config.rollout_length)
+
+    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def remember(self, replay: ReplayState, trajectory: ppo.Trajectory) -> ReplayState:
+        """Step 1, second line: the real steps enter the replay buffer."""
+        return self.replay.add(replay, trajectory)
+
+    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def learn(self, learner: ppo.Learner, trajectory: ppo.Trajectory) -> tuple[ppo.Learner, Metrics]:
+        """Step 2: PPO on the real steps."""
+        config = self.config.ppo
+        return ppo.update(
+            config,
+            self.policy_optimizer,
+            self.policy_graph,
+            learner,
+            trajectory,
+            epochs=config.epochs,
+            minibatches=config.minibatches,
+            entropy_coefficient=config.entropy_coefficient,
+        )
+
+    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def update_tokenizer(
+        self, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array
+    ) -> tuple[TokenizerState, Metrics]:
+        """Step 3, first half (Algorithm 5): the tokenizer learns from replayed frames."""
+        config = self.config.world_model
+
+        def update(tokenizer, key):
+            frames = self.replay.sample(replay, key, config.sequences // config.minibatches, config.sequence_length)
+            shape = self.spec.observation.shape
+            return self.tokenizer.update(tokenizer, frames.observation.reshape(-1, *shape))
+
+        keys = jax.random.split(key, self.config.tokenizer.updates * config.minibatches)
+        tokenizer, metrics = jax.lax.scan(update, tokenizer, keys)
+        return tokenizer, {name: values[-1] for name, values in metrics.items()}
+
+    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def update_world_model(
+        self,
+        learner: world_model_training.WorldModelLearner,
+        tokenizer: TokenizerState,
+        replay: ReplayState,
+        key: jax.Array,
+    ) -> tuple[world_model_training.WorldModelLearner, Metrics]:
+        """Step 3, second half (Algorithm 5): the transformer learns from replayed sequences of T_WM + 1 frames."""
+        config = self.config.world_model
+
+        def update(learner, key):
+            sample_key, dropout_key = jax.random.split(key)
+            length = config.sequence_length + 1
+            batch = self.replay.sample(replay, sample_key, config.sequences // config.minibatches, length)
+            return world_model_training.update(
+                config,
+                self.world_model_optimizer,
+                self.world_model_graph,
+                self.tokens,
+                learner,
+                self.tokenizer.encode(tokenizer, batch.observation),
+                batch.action[:, :-1],
+                batch.reward[:, :-1],
+                batch.terminated[:, :-1],
+                batch.first[:, 1:],
+                dropout_key,
+            )
+
+        learner, metrics = jax.lax.scan(update, learner, jax.random.split(key, config.updates * config.minibatches))
+        return learner, jax.tree.map(jnp.mean, metrics)
+
+    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def imagine(
+        self,
+        learner: ppo.Learner,
+        world_model: nnx.State,
+        tokenizer: TokenizerState,
+        replay: ReplayState,
+        key: jax.Array,
+        updates: jax.Array,
+    ) -> tuple[ppo.Learner, Metrics]:
+        """Step 4: `updates` times (a traced number, so that annealing never recompiles), dream and learn from it."""
+        model = nnx.merge(self.world_model_graph, world_model)
+
+        def update(i, carry):
+            learner, total = carry
+            trajectory = self.dream(learner, model, tokenizer, replay, jax.random.fold_in(key, i))
+            learner, metrics = self.learn_from_dream(learner, trajectory)
+            metrics |= {"reward": trajectory.reward_TB.mean(), "termination": trajectory.terminated_TB.mean(dtype=jnp.float32)}
+            return learner, jax.tree.map(jnp.add, total, metrics)
+
+        zeros = dict.fromkeys(self.imagination_metrics, jnp.zeros(()))
+        learner, total = jax.lax.fori_loop(0, updates, update, (learner, zeros))
+        return learner, jax.tree.map(lambda x: x / updates.astype(jnp.float32), total)
+
+    def dream(
+        self, learner: ppo.Learner, model: WorldModel, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array
+    ) -> ppo.Trajectory:
+        """One imagined rollout from replayed frames, the memory refreshed on the M frames before each (note 12)."""
+        plan, policy = self.config.imagination, self._policy(learner)
+        sample_key, start_key, rollout_key = jax.random.split(key, 3)
+        burn_in = self.config.environment.burn_in
+        past = self.replay.sample(replay, sample_key, plan.num_envs, burn_in + 1)
+        past = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), past)
+        dream = Dream(
+            model, self.tokenizer, tokenizer, self.spec, self.tokens, plan.horizon, past.observation[-1]
+        )
+        player = play.start(policy, dream, start_key, 0)
+        hidden_BH = policy.advance(past.observation[:-1], past.first[:-1], player.hidden_BH) if burn_in else player.hidden_BH
+        player = player.replace(time_step=player.time_step.replace(first=past.first[-1]), hidden_BH=hidden_BH)
+        _, trajectory, _ = play.rollout(rollout_key, policy, learner.targets, dream, player, plan.horizon)
+        return trajectory
+
+    def learn_from_dream(self, learner: ppo.Learner, trajectory: ppo.Trajectory) -> tuple[ppo.Learner, Metrics]:
+        """PPO on one imagined trajectory."""
+        plan = self.config.imagination
+        return ppo.update(
+            self.config.ppo,
+            self.policy_optimizer,
+            self.policy_graph,
+            learner,
+            trajectory,
+            epochs=plan.epochs,
+            minibatches=plan.minibatches,
+            entropy_coefficient=plan.entropy_coefficient,
+        )

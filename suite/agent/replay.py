@@ -1,0 +1,90 @@
+"""Replay of real frames: flashbax's trajectory buffer, one row per environment, uint8 (fidelity note 14).
+
+Rows are contiguous in time over the whole run, so a sampled sequence may cross an episode's end (note 21).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import flashbax as fbx
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from suite.config import Config
+from suite.interface.environment import EnvironmentSpec
+from suite.policy.ppo import Trajectory
+
+ReplayState = Any  # flashbax's TrajectoryBufferState
+
+
+@struct.dataclass
+class Experience:
+    """Real steps; leading axes [B, T]. At each: the frame, the action taken on it and what that led to.
+
+    Attributes:
+      observation: uint8, the frame acted on.
+      action: int32.
+      reward: float32.
+      terminated: bool; the step ended the episode by the rules.
+      first: bool; the frame opens an episode.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    first: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """The buffer's shape, and the functions that work on its state."""
+
+    num_envs: int
+    length: int  # time steps kept of each environment
+
+    @classmethod
+    def of(cls, config: Config) -> Replay:
+        """`replay.capacity` frames over all environments: 128,000 / 48 = 2,666 steps of each."""
+        return cls(config.environment.num_envs, config.replay.capacity // config.environment.num_envs)
+
+    @functools.lru_cache(maxsize=8)  # noqa: B019 -- frozen, and as long-lived as the process
+    def _buffer(self, batch: int, length: int) -> Any:
+        return fbx.make_trajectory_buffer(
+            add_batch_size=self.num_envs,
+            sample_batch_size=batch,
+            sample_sequence_length=length,
+            period=1,
+            min_length_time_axis=length,
+            max_length_time_axis=self.length,
+        )
+
+    def init(self, spec: EnvironmentSpec) -> ReplayState:
+        """An empty buffer."""
+        step = Experience(
+            observation=jnp.zeros(spec.observation.shape, jnp.uint8),
+            action=jnp.zeros((), jnp.int32),
+            reward=jnp.zeros((), jnp.float32),
+            terminated=jnp.zeros((), bool),
+            first=jnp.zeros((), bool),
+        )
+        return self._buffer(1, 1).init(step)
+
+    def add(self, state: ReplayState, trajectory: Trajectory) -> ReplayState:
+        """Appends a trajectory (time-major, [T, B]); the oldest steps give way."""
+        experience = Experience(
+            observation=trajectory.observation_TB,
+            action=trajectory.action_TB,
+            reward=trajectory.reward_TB,
+            terminated=trajectory.terminated_TB,
+            first=trajectory.first_TB,
+        )
+        return self._buffer(1, 1).add(state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), experience))
+
+    def sample(self, state: ReplayState, key: jax.Array, batch: int, length: int) -> Experience:
+        """`batch` sequences of `length` consecutive steps, uniform over all stored; leading axes [batch, length]."""
+        return self._buffer(batch, length).sample(state, key).experience

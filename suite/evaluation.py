@@ -1,0 +1,125 @@
+"""Whole episodes of a checkpoint's policy under a task's protocol: sampled actions, no learning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from suite import checkpoint, registry
+from suite.agent.dyna import Agent
+from suite.agent.rollout import EpisodeLog
+from suite.compilation import enable_compilation_cache
+from suite.config import Config
+from suite.errors import UserError
+from suite.interface.environment import EnvironmentSpec
+from suite.policy.ppo import Learner
+from suite.record import RunRecord
+from suite.reporting import Reporter
+
+
+def episode_rows(log: EpisodeLog, spec: EnvironmentSpec, ended_TB: np.ndarray, first_step: int) -> list[dict[str, Any]]:
+    """One row per ended episode, in the order of play.
+
+    Args:
+      log: totals at every step, on the host.
+      spec: names the statistics.
+      ended_TB: which episodes to report.
+      first_step: real steps taken before this rollout; an episode's `step` counts all environments' steps up to
+        and including its last.
+    """
+    rows = []
+    num_envs = ended_TB.shape[1]
+    for t, b in zip(*np.nonzero(ended_TB), strict=True):
+        row: dict[str, Any] = {
+            "step": first_step + (int(t) + 1) * num_envs,
+            "return": float(log.return_TB[t, b]),
+            "length": int(log.length_TB[t, b]),
+        }
+        for name, shape in spec.statistics:
+            value = log.statistics_TB[name][t, b]
+            if shape:
+                row |= {achievement: int(v) for achievement, v in zip(spec.achievements, value, strict=True)}
+            else:
+                row[name] = float(value)
+        rows.append(row)
+    return rows
+
+
+def play_episodes(agent: Agent, learner: Learner, key: jax.Array, episodes: int) -> list[dict[str, Any]]:
+    """At least `episodes` whole episodes: the first of each of N_env environments, as often as it takes.
+
+    Taking each environment's first episode, however long, keeps short episodes from being over-counted. Rows have
+    `step` counted from the start of the evaluation.
+    """
+    rows: list[dict[str, Any]] = []
+    while len(rows) < episodes:
+        key, start_key = jax.random.split(key)
+        player = agent.start(learner, start_key)
+        unfinished_B = np.ones(agent.batched.num_envs, bool)
+        step = 0
+        while unfinished_B.any():
+            key, play_key = jax.random.split(key)
+            player, _, log = agent.collect(learner, player, play_key)
+            log = jax.device_get(log)
+            earlier_TB = np.cumsum(log.ended_TB, axis=0) - log.ended_TB  # ends before each step
+            ended_TB = log.ended_TB & (earlier_TB == 0) & unfinished_B
+            rows += episode_rows(log, agent.spec, ended_TB, step)
+            unfinished_B &= ~log.ended_TB.any(axis=0)
+            step += log.ended_TB.size
+    return rows
+
+
+def model_of(learner: Learner, tokenizer: Any, world_model_params: Any) -> dict[str, Any]:
+    """What a checkpoint keeps for evaluation and inspection: parameters, value statistics, codebook."""
+    return {
+        "policy": learner.params,
+        "targets": learner.targets,
+        "tokenizer": tokenizer,
+        "world_model": world_model_params,
+    }
+
+
+def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str, Any]:
+    """Plays whole episodes with the newest checkpoint of a run folder and appends them to `evaluations.csv`.
+
+    Args:
+      folder: a run folder.
+      episodes: at least so many; None: one per environment.
+      reporter: where progress goes.
+
+    Returns:
+      the task's scores over those episodes, plus "episodes" and "step" of the checkpoint.
+
+    Raises:
+      UserError: not a run folder, another schema, or no usable checkpoint.
+    """
+    with RunRecord.open(folder) as record:
+        config = record.config
+        entry = registry.task(config.task)
+        enable_compilation_cache()
+        agent = Agent(config, entry.make()(progress=reporter.texture))
+        template = jax.eval_shape(agent.init, jax.random.key(0))
+        restored = checkpoint.restore_latest(folder / "checkpoints", _model_template(template))
+        if restored is None:
+            raise UserError(f"{folder} has no checkpoint to evaluate; run it first: suite run {config.task}")
+        for warning in restored.warnings:
+            reporter.warning(warning)
+        learner = template.learner.replace(params=restored.model["policy"], targets=restored.model["targets"], optimizer=None)
+        rows = play_episodes(agent, learner, evaluation_key(config), episodes or config.environment.num_envs)
+        for row in rows:
+            row["step"] = restored.step
+        record.append_evaluation(rows)
+        return {"step": restored.step, "episodes": len(rows), **entry.scores()(rows, agent.spec)}
+
+
+def evaluation_key(config: Config) -> jax.Array:
+    """Randomness of evaluation, apart from training's."""
+    return jax.random.fold_in(jax.random.key(config.seed), 1)
+
+
+def _model_template(state: Any) -> dict[str, Any]:
+    model = state.world_model
+    return model_of(state.learner, state.tokenizer, None if model is None else model.params)

@@ -1,0 +1,234 @@
+"""One run, start to finish: build, resume, train, evaluate, record."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from suite import checkpoint, registry
+from suite.agent.dyna import Agent, TrainState
+from suite.compilation import enable_compilation_cache
+from suite.config import Config
+from suite.errors import RunError, UserError
+from suite.evaluation import episode_rows, evaluation_key, model_of, play_episodes
+from suite.record import RunRecord, disk_full_is_an_error
+from suite.reporting import Reporter
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What a run came to. `status`: "finished", "stopped" (by a signal) or "already finished"."""
+
+    folder: Path
+    status: str
+    steps: int
+    wall_seconds: float
+    scores: dict[str, float]
+
+
+def run(config: Config, out: Path, reporter: Reporter, resume: bool = False) -> Result:
+    """Trains one agent on one task, or goes on where an earlier call of the same command stopped.
+
+    Args:
+      config: the resolved configuration.
+      out: the folder of all runs; this one's is `<out>/<task>/<agent>/<preset>/seed_<n>`.
+      reporter: where progress goes.
+      resume: insist that there is a run to go on with.
+
+    Raises:
+      UserError: before anything is compiled: the folder cannot be written, is in use, or holds another run.
+      RunError: the loss diverged or the disk is full; the last good checkpoint stays.
+    """
+    entry = registry.task(config.task)
+    folder = out / config.task / config.agent / config.preset / f"seed_{config.seed}"
+    if resume and not (folder / "record.json").exists():
+        raise UserError(f"nothing to resume in {folder}: run without --resume to start there")
+    with RunRecord.open_or_create(folder, config, entry.spec()) as record, disk_full_is_an_error():
+        if record.finished:
+            return _result(record, "already finished")
+        enable_compilation_cache()
+        agent = Agent(config, entry.make()(progress=reporter.texture))
+        return _Training(agent, record, reporter).run()
+
+
+class _Training:
+    """The host's side of a run: phases in order, their metrics and timing, checkpoints, signals."""
+
+    def __init__(self, agent: Agent, record: RunRecord, reporter: Reporter):
+        self.agent, self.config, self.record, self.reporter = agent, agent.config, record, reporter
+        self.checkpoints = record.folder / "checkpoints"
+        self.key = jax.random.key(self.config.seed)
+        self.iteration = 0
+        self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
+        self.stop_requested = False
+
+    @property
+    def steps(self) -> int:
+        return self.iteration * self.config.steps_per_iteration
+
+    def run(self) -> Result:
+        started = time.monotonic()
+        with self._phase("start"):
+            state = self._restore()
+        self.reporter.start(self.config.total_steps, self.steps)
+        try:
+            with self._signals():
+                while self.iteration < self.config.iterations and not self.stop_requested:
+                    state = self._iterate(state)
+                    if self._checkpoint_due() or self.stop_requested:
+                        self._save(state)
+                if self.iteration == self.config.iterations:
+                    self._finish(state)
+        finally:
+            self.reporter.stop()
+            self.record.add_wall_clock(time.monotonic() - started, self.seconds)
+        return _result(self.record, "finished" if self.record.finished else "stopped")
+
+    def _restore(self) -> TrainState:
+        init_key = jax.random.fold_in(self.key, 0)
+        template = jax.eval_shape(self.agent.init, init_key)
+        restored = checkpoint.restore_latest(self.checkpoints, *_split(template))
+        if restored is None:
+            self.record.rewind(0)
+            return self.agent.init(init_key)
+        for warning in restored.warnings:
+            self.reporter.warning(warning)
+        self.iteration = restored.host["iteration"]
+        self.seconds = restored.host["seconds"]
+        self.record.rewind(self.steps)
+        self.reporter.message(f"resuming at step {self.steps:,}")
+        return _join(restored.model, restored.resume)
+
+    def _iterate(self, state: TrainState) -> TrainState:
+        """One iteration of Algorithm 1. Randomness depends only on the seed and the iteration."""
+        agent, config, metrics = self.agent, self.config, {}
+        keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(self.key, 2), self.iteration), 4)
+        learner, player, replay = state.learner, state.player, state.replay
+        tokenizer, world_model = state.tokenizer, state.world_model
+        with self._phase("collect"):
+            player, trajectory, log = agent.collect(learner.acting, player, keys[0])
+            if replay is not None:
+                replay = agent.remember(replay, trajectory)
+            log = jax.device_get(log)
+            reward = float(trajectory.reward_TB.mean())
+        rows = episode_rows(log, agent.spec, log.ended_TB, self.steps)
+        self.iteration += 1
+        if config.ppo.learn_from_real and config.policy.kind != "uniform":
+            with self._phase("learn"):
+                learner, found = agent.learn(learner, trajectory)
+                metrics |= self._check("learn", found)
+        del trajectory
+        if world_model is not None:
+            with self._phase("tokenizer"):
+                tokenizer, found = agent.update_tokenizer(tokenizer, replay, keys[1])
+                metrics |= self._check("tokenizer", found)
+            with self._phase("world_model"):
+                world_model, found = agent.update_world_model(world_model, tokenizer, replay, keys[2])
+                metrics |= self._check("world_model", found)
+            updates = config.imagined_updates(self.steps)
+            if updates:
+                with self._phase("imagine"):
+                    learner, found = agent.imagine(
+                        learner, world_model.params, tokenizer, replay, keys[3], jnp.asarray(updates, jnp.int32)
+                    )
+                    metrics |= self._check("imagine", found)
+        self.record.append_episodes(rows)
+        returns = [row["return"] for row in rows]
+        summary = {"reward_per_step": reward, "episodes": len(rows)}
+        summary["return"] = float(np.mean(returns)) if returns else float("nan")
+        self.record.append_metrics({"step": self.steps, **summary, **metrics}, agent.metric_names)
+        self.reporter.update(self.steps, "", {"return": summary["return"]})
+        return TrainState(learner, player, replay, tokenizer, world_model)
+
+    @contextlib.contextmanager
+    def _phase(self, name: str) -> Iterator[None]:
+        self.reporter.update(self.steps, name, {})
+        start = time.monotonic()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
+
+    def _check(self, phase: str, metrics: dict[str, jax.Array]) -> dict[str, float]:
+        """Metrics on the host, prefixed by their phase; stops the run where a loss or gradient is not finite."""
+        found = {f"{phase}/{name}": float(value) for name, value in jax.device_get(metrics).items()}
+        for name, value in found.items():
+            if not np.isfinite(value):
+                kept = checkpoint.latest_step(self.checkpoints)
+                where = "no checkpoint was saved yet" if kept is None else f"the checkpoint at step {kept:,} is kept"
+                raise RunError(f"{name} became {value} in phase {phase} at step {self.steps:,}; {where}")
+        return found
+
+    def _checkpoint_due(self) -> bool:
+        every = self.config.checkpoint.every_steps
+        return self.steps // every > (self.steps - self.config.steps_per_iteration) // every
+
+    def _save(self, state: TrainState) -> None:
+        with self._phase("checkpoint"):
+            host = {"iteration": self.iteration, "seconds": self.seconds}
+            model, resume = _split(state)
+            checkpoint.save(self.checkpoints, self.steps, model, resume, host, keep=self.config.checkpoint.keep)
+
+    def _finish(self, state: TrainState) -> None:
+        """Saves the last checkpoint, plays the final evaluation, and closes the record."""
+        if checkpoint.latest_step(self.checkpoints) != self.steps:
+            self._save(state)
+        with self._phase("evaluate"):
+            rows = play_episodes(
+                self.agent, state.learner.acting, evaluation_key(self.config), self.config.environment.num_envs
+            )
+            self.record.append_evaluation([{**row, "step": self.steps} for row in rows])
+        self.record.finish(self.steps)
+        checkpoint.drop_resume(self.checkpoints)
+
+    @contextlib.contextmanager
+    def _signals(self) -> Iterator[None]:
+        """The first SIGINT or SIGTERM ends the run after this iteration, with a checkpoint; the second at once."""
+
+        def stop(number: int, frame: Any) -> None:
+            if self.stop_requested:
+                raise KeyboardInterrupt
+            self.stop_requested = True
+            self.reporter.message("stopping after this iteration, with a checkpoint (again: stop now)")
+
+        try:
+            before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        except ValueError:  # not in the main thread: whoever runs us there handles signals
+            before = {}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def _split(state: TrainState) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A checkpoint's two items: what evaluation needs, and what only going on needs."""
+    world_model = state.world_model
+    resume = {"optimizer": state.learner.optimizer, "player": state.player, "replay": state.replay}
+    resume["world_model_optimizer"] = None if world_model is None else world_model.optimizer
+    return model_of(state.learner, state.tokenizer, None if world_model is None else world_model.params), resume
+
+
+def _join(model: dict[str, Any], resume: dict[str, Any]) -> TrainState:
+    """The inverse of `_split`."""
+    from suite.policy.ppo import Learner
+    from suite.world_model.training import WorldModelLearner
+
+    world_model = None
+    if model["world_model"] is not None:
+        world_model = WorldModelLearner(params=model["world_model"], optimizer=resume["world_model_optimizer"])
+    learner = Learner(params=model["policy"], optimizer=resume["optimizer"], targets=model["targets"])
+    return TrainState(learner, resume["player"], resume["replay"], model["tokenizer"], world_model)
+
+
+def _result(record: RunRecord, status: str) -> Result:
+    scores = registry.task(record.config.task).scores()(record.episodes(), record.config, record.spec)
+    return Result(record.folder, status, record.steps, record.wall_seconds, scores)

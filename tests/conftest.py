@@ -1,0 +1,22 @@
+"""Every test runs under strict dtype and rank promotion; pyproject.toml turns warnings into errors."""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def compilation_cache():
+    """Compile each Craftax program once per machine, as users do."""
+    from suite.compilation import enable_compilation_cache
+
+    enable_compilation_cache()
