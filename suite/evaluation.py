@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import pandas as pd
 
 from suite import checkpoint, registry
 from suite.agent.dyna import Agent
@@ -107,12 +108,17 @@ def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str
             raise UserError(f"{folder} has no checkpoint to evaluate; run it first: suite run {config.task}")
         for warning in restored.warnings:
             reporter.warning(warning)
-        learner = template.learner.replace(params=restored.model["policy"], targets=restored.model["targets"], optimizer=None)
-        rows = play_episodes(agent, learner, evaluation_key(config), episodes or config.environment.num_envs)
-        for row in rows:
-            row["step"] = restored.step
-        record.append_evaluation(rows)
-        return {"step": restored.step, "episodes": len(rows), **entry.scores()(rows, agent.spec)}
+        learner = Learner(params=restored.model["policy"], optimizer=None, targets=restored.model["targets"])
+        count = episodes or config.environment.num_envs
+        return record_evaluation(record, agent, learner, restored.step, count)
+
+
+def record_evaluation(record: RunRecord, agent: Agent, learner: Learner, step: int, episodes: int) -> dict[str, Any]:
+    """Plays whole episodes with the policy of `step`, records them, and returns their scores."""
+    rows = play_episodes(agent, learner, evaluation_key(agent.config), episodes)
+    record.append_evaluation({**row, "step": step} for row in rows)
+    scores = registry.task(agent.config.task).scores()(pd.DataFrame(rows), None, agent.spec)
+    return {"step": step, "episodes": len(rows), **scores}
 
 
 def evaluation_key(config: Config) -> jax.Array:

@@ -19,9 +19,11 @@ from suite.agent.dyna import Agent, TrainState
 from suite.compilation import enable_compilation_cache
 from suite.config import Config
 from suite.errors import RunError, UserError
-from suite.evaluation import episode_rows, evaluation_key, model_of, play_episodes
-from suite.record import RunRecord, disk_full_is_an_error
+from suite.evaluation import episode_rows, model_of, record_evaluation
+from suite.policy.ppo import Learner
+from suite.record import RunRecord, disk_full_is_an_error, run_folder
 from suite.reporting import Reporter
+from suite.world_model.training import WorldModelLearner
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +51,7 @@ def run(config: Config, out: Path, reporter: Reporter, resume: bool = False) -> 
       RunError: the loss diverged or the disk is full; the last good checkpoint stays.
     """
     entry = registry.task(config.task)
-    folder = out / config.task / config.agent / config.preset / f"seed_{config.seed}"
+    folder = run_folder(out, config)
     if resume and not (folder / "record.json").exists():
         raise UserError(f"nothing to resume in {folder}: run without --resume to start there")
     with RunRecord.open_or_create(folder, config, entry.spec()) as record, disk_full_is_an_error():
@@ -77,10 +79,11 @@ class _Training:
 
     def run(self) -> Result:
         started = time.monotonic()
-        with self._phase("start"):
-            state = self._restore()
-        self.reporter.start(self.config.total_steps, self.steps)
+        self.reporter.start(self.config.total_steps, 0)
         try:
+            with self._phase("start"):
+                state = self._restore()
+            self.reporter.start(self.config.total_steps, self.steps)
             with self._signals():
                 while self.iteration < self.config.iterations and not self.stop_requested:
                     state = self._iterate(state)
@@ -143,10 +146,10 @@ class _Training:
                     metrics |= self._check("imagine", found)
         self.record.append_episodes(rows)
         returns = [row["return"] for row in rows]
-        summary = {"reward_per_step": reward, "episodes": len(rows)}
-        summary["return"] = float(np.mean(returns)) if returns else float("nan")
+        mean_return = float(np.mean(returns)) if returns else None
+        summary = {"reward_per_step": reward, "episodes": len(rows), "return": mean_return}
         self.record.append_metrics({"step": self.steps, **summary, **metrics}, agent.metric_names)
-        self.reporter.update(self.steps, "", {"return": summary["return"]})
+        self.reporter.update(self.steps, "", {} if mean_return is None else {"return": mean_return})
         return TrainState(learner, player, replay, tokenizer, world_model)
 
     @contextlib.contextmanager
@@ -181,10 +184,8 @@ class _Training:
         if checkpoint.latest_step(self.checkpoints) != self.steps:
             self._save(state)
         with self._phase("evaluate"):
-            rows = play_episodes(
-                self.agent, state.learner.acting, evaluation_key(self.config), self.config.environment.num_envs
-            )
-            self.record.append_evaluation([{**row, "step": self.steps} for row in rows])
+            episodes = self.config.environment.num_envs
+            record_evaluation(self.record, self.agent, state.learner.acting, self.steps, episodes)
         self.record.finish(self.steps)
         checkpoint.drop_resume(self.checkpoints)
 
@@ -219,9 +220,6 @@ def _split(state: TrainState) -> tuple[dict[str, Any], dict[str, Any]]:
 
 def _join(model: dict[str, Any], resume: dict[str, Any]) -> TrainState:
     """The inverse of `_split`."""
-    from suite.policy.ppo import Learner
-    from suite.world_model.training import WorldModelLearner
-
     world_model = None
     if model["world_model"] is not None:
         world_model = WorldModelLearner(params=model["world_model"], optimizer=resume["world_model_optimizer"])

@@ -95,9 +95,7 @@ class Agent:
         policy_key, player_key, tokenizer_key, model_key = jax.random.split(key, 4)
         policy = self._new_policy(nnx.Rngs(policy_key))
         params = nnx.state(policy)
-        learner = ppo.Learner(
-            params=params, optimizer=self.policy_optimizer.init(params), targets=ppo.TargetStatistics.init()
-        )
+        learner = ppo.Learner.create(self.config.ppo, self.policy_optimizer, params)
         state = TrainState(learner=learner, player=self._start(policy, player_key))
         if not self.config.world_model.enabled:
             return state
@@ -178,17 +176,20 @@ class Agent:
             sample_key, dropout_key = jax.random.split(key)
             length = config.sequence_length + 1
             batch = self.replay.sample(replay, sample_key, config.sequences // config.minibatches, length)
+            sequences = world_model_training.Sequences(
+                tokens_BTL=self.tokenizer.encode(tokenizer, batch.observation),
+                action_BT=batch.action[:, :-1],
+                reward_BT=batch.reward[:, :-1],
+                terminated_BT=batch.terminated[:, :-1],
+                ended_BT=batch.first[:, 1:],
+            )
             return world_model_training.update(
                 config,
                 self.world_model_optimizer,
                 self.world_model_graph,
                 self.tokens,
                 learner,
-                self.tokenizer.encode(tokenizer, batch.observation),
-                batch.action[:, :-1],
-                batch.reward[:, :-1],
-                batch.terminated[:, :-1],
-                batch.first[:, 1:],
+                sequences,
                 dropout_key,
             )
 
@@ -225,15 +226,17 @@ class Agent:
         """One imagined rollout from replayed frames, the memory refreshed on the M frames before each (note 12)."""
         plan, policy = self.config.imagination, self._policy(learner)
         sample_key, start_key, rollout_key = jax.random.split(key, 3)
-        burn_in = self.config.environment.burn_in
-        past = self.replay.sample(replay, sample_key, plan.num_envs, burn_in + 1)
+        past = self.replay.sample(replay, sample_key, plan.num_envs, self.config.environment.burn_in + 1)
         past = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), past)
         dream = Dream(
             model, self.tokenizer, tokenizer, self.spec, self.tokens, plan.horizon, past.observation[-1]
         )
         player = play.start(policy, dream, start_key, 0)
-        hidden_BH = policy.advance(past.observation[:-1], past.first[:-1], player.hidden_BH) if burn_in else player.hidden_BH
-        player = player.replace(time_step=player.time_step.replace(first=past.first[-1]), hidden_BH=hidden_BH)
+        player = player.replace(
+            time_step=player.time_step.replace(first=past.first[-1]),
+            recent=play.Recent(past.observation[:-1], past.first[:-1], player.hidden_BH),
+        )
+        player = play.refresh(policy, player, carried=False)
         _, trajectory, _ = play.rollout(rollout_key, policy, learner.targets, dream, player, plan.horizon)
         return trajectory
 

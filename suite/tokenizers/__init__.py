@@ -1,0 +1,25 @@
+"""Tokenizers: from observations to tokens and back."""
+
+from __future__ import annotations
+
+from suite.config import TokenizerConfig
+from suite.errors import UserError
+from suite.interface.environment import ObservationSpec
+from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
+
+
+def make_tokenizer(config: TokenizerConfig, observation: ObservationSpec) -> NearestNeighborTokenizer:
+    """The tokenizer that `config.kind` names, for these observations.
+
+    Raises:
+      UserError: the patches do not fill the frame.
+    """
+    patch = config.patch or observation.patch
+    if patch is None:
+        raise UserError(f"tokenizer.kind={config.kind} needs frames of patches, not {observation.kind}")
+    tokenizer = NearestNeighborTokenizer(config.codebook_size, config.threshold, patch, observation)
+    try:
+        tokenizer.grid
+    except ValueError as error:
+        raise UserError(f"tokenizer.patch={patch}: {error}") from error
+    return tokenizer

@@ -1,0 +1,132 @@
+"""Craftax-classic from pixels (Matthews et al. 2024) as a pure environment.
+
+Importing this module loads no game and touches no device; `make_classic` does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from suite.interface.environment import Environment, EnvironmentSpec, ObservationSpec, TimeStep
+
+CLASSIC_SPEC = EnvironmentSpec(
+    id="craftax_classic",
+    observation=ObservationSpec(shape=(63, 63, 3), high=255, kind="pixels", patch=(7, 7)),
+    num_actions=17,
+    reward_classes=(0.0, 1.0),
+    max_return=22.0,
+    achievements=(
+        "collect_wood",
+        "place_table",
+        "eat_cow",
+        "collect_sapling",
+        "collect_drink",
+        "make_wood_pickaxe",
+        "make_wood_sword",
+        "place_plant",
+        "defeat_zombie",
+        "collect_stone",
+        "place_stone",
+        "eat_plant",
+        "defeat_skeleton",
+        "make_stone_pickaxe",
+        "make_stone_sword",
+        "wake_up",
+        "place_furnace",
+        "collect_coal",
+        "collect_iron",
+        "collect_diamond",
+        "make_iron_pickaxe",
+        "make_iron_sword",
+    ),
+    statistics=(("achievements", (22,)), ("achievement_return", ()), ("health_return", ())),
+    package="craftax",
+)
+
+START_HEALTH = 9
+HEALTH_REWARD = 0.1  # per point of health gained or lost
+
+
+def make_classic(progress: Callable[[str, float], None] | None = None) -> Environment:
+    """Craftax-classic, ready to be compiled.
+
+    Args:
+      progress: called with a message and the fraction done; loading the game takes a second or two.
+    """
+    report = progress or (lambda message, fraction: None)
+    report("Loading Craftax-classic", 0.0)
+    environment = CraftaxClassic()
+    report("Loading Craftax-classic", 1.0)
+    return environment
+
+
+class CraftaxClassic:
+    """One game of Craftax-classic; see `suite.interface.environment.Environment`.
+
+    Observations are uint8 [63, 63, 3]: craftax's float frames in [0, 1] times 255, rounded (fidelity note 14). The
+    reward is the game's own. An episode ends by death (terminated) or, alive, after `max_timesteps` (truncated).
+
+    The state is craftax's `EnvState`. The statistics need none of their own: an achievement is never lost, and what
+    health adds to the return telescopes to 0.1 x (health - 9) (fidelity note 29).
+    """
+
+    spec = CLASSIC_SPEC
+
+    def __init__(self, max_timesteps: int = 10_000):
+        from craftax.craftax_classic import game_logic, world_gen
+        from craftax.craftax_classic.envs.craftax_state import EnvParams, StaticEnvParams
+
+        from adapters.craftax_renderer import make_renderer
+
+        self._params, self._sizes = EnvParams(max_timesteps=max_timesteps), StaticEnvParams()
+        self._game, self._generate_world, self._render = game_logic, world_gen.generate_world, make_renderer()
+
+    def reset(self, key: jax.Array) -> tuple[Any, TimeStep]:
+        """A freshly generated world."""
+        with _craftax_numerics():
+            state = self._generate_world(key, self._params, self._sizes)
+        state = jax.tree.map(_strong, state)
+        no = jnp.zeros((), bool)
+        return state, self._time_step(state, jnp.zeros(()), terminated=no, truncated=no, first=~no)
+
+    def step(self, key: jax.Array, state: Any, action: jax.Array) -> tuple[Any, TimeStep]:
+        """One step of the game."""
+        with _craftax_numerics():
+            stepped, reward = self._game.craftax_step(key, state, action, self._params, self._sizes)
+            over = self._game.is_game_over(stepped, self._params)
+        # In the types of `state`, so that a compiled step can be fed its own output.
+        stepped = jax.tree.map(lambda new, old: _strong(new, old.dtype), stepped, state)
+        truncated = (stepped.timestep >= self._params.max_timesteps) & (stepped.player_health > 0)
+        flags = {"terminated": over & ~truncated, "truncated": truncated, "first": jnp.zeros((), bool)}
+        return stepped, self._time_step(stepped, _strong(reward, jnp.dtype(jnp.float32)), **flags)
+
+    def _time_step(self, state: Any, reward: jax.Array, **flags: jax.Array) -> TimeStep:
+        observation = jnp.round(self._render(state)).astype(jnp.uint8)
+        statistics = {
+            "achievements": state.achievements,
+            "achievement_return": state.achievements.sum(dtype=jnp.float32),
+            "health_return": HEALTH_REWARD * (state.player_health - START_HEALTH).astype(jnp.float32),
+        }
+        return TimeStep(
+            observation=observation, final_observation=observation, reward=reward, statistics=statistics, **flags
+        )
+
+
+@contextlib.contextmanager
+def _craftax_numerics() -> Iterator[None]:
+    """craftax mixes types and ranks as NumPy does, whatever stricter rules the caller is traced under."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+def _strong(value: Any, dtype: Any = None) -> jax.Array:
+    """`value` as an array whose type does not give way to others: jax's weak types compile once more."""
+    array = jnp.asarray(value)
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        return array
+    return jax.lax.convert_element_type(array, dtype or array.dtype)

@@ -1,0 +1,86 @@
+"""What each preset changes for each task. `paper` changes nothing for Craftax-classic: the defaults are the paper's.
+
+Presets scale sizes and counts; what defines an agent is applied after them (`suite.registry`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from suite.config import Config
+from suite.overrides import apply_changes
+
+
+def paper(config: Config) -> Config:
+    """Appendix A to the letter, as the fidelity notes settle it."""
+    return config
+
+
+CRAFTAX_CLASSIC_SMALL: dict[str, Any] = {
+    "protocol.steps": 100_000,
+    "environment.num_envs": 16,
+    "environment.rollout_length": 64,
+    "policy.cnn_channels": (16, 32, 32),
+    "policy.blocks_per_stack": 1,
+    "policy.convs_per_block": 1,
+    "policy.hidden_size": 256,
+    "policy.dense_blocks": 1,
+    "policy.rnn_size": 128,
+    "ppo.minibatches": 4,
+    "ppo.epochs": 3,
+    "replay.capacity": 32_000,
+    "tokenizer.codebook_size": 1024,
+    "tokenizer.updates": 5,
+    "world_model.embed_dim": 64,
+    "world_model.layers": 2,
+    "world_model.heads": 4,
+    "world_model.sequence_length": 10,
+    "world_model.sequences": 24,
+    "world_model.minibatches": 3,
+    "world_model.updates": 20,
+    "imagination.start_step": 40_000,
+    "imagination.horizon": 10,
+    "imagination.num_envs": 16,
+    "imagination.updates": 20,
+    "checkpoint.every_steps": 25_000,
+}
+
+CRAFTAX_CLASSIC_SMOKE: dict[str, Any] = {
+    "protocol.steps": 64,
+    "environment.num_envs": 4,
+    "environment.rollout_length": 8,
+    "environment.burn_in": 2,
+    "policy.cnn_channels": (4, 4, 4),
+    "policy.blocks_per_stack": 1,
+    "policy.convs_per_block": 1,
+    "policy.hidden_size": 16,
+    "policy.dense_blocks": 1,
+    "policy.rnn_size": 8,
+    "ppo.minibatches": 2,
+    "ppo.epochs": 1,
+    "replay.capacity": 128,
+    "tokenizer.codebook_size": 128,
+    "tokenizer.updates": 1,
+    "world_model.embed_dim": 16,
+    "world_model.layers": 1,
+    "world_model.heads": 2,
+    "world_model.sequence_length": 4,
+    "world_model.sequences": 4,
+    "world_model.minibatches": 2,
+    "world_model.updates": 2,
+    "imagination.start_step": 32,
+    "imagination.horizon": 3,
+    "imagination.num_envs": 4,
+    "imagination.updates": 2,
+    "checkpoint.every_steps": 32,
+}
+
+
+def craftax_classic_small(config: Config) -> Config:
+    """Minutes on two CPU cores."""
+    return apply_changes(config, CRAFTAX_CLASSIC_SMALL)
+
+
+def craftax_classic_smoke(config: Config) -> Config:
+    """Two iterations, the second one with imagination."""
+    return apply_changes(config, CRAFTAX_CLASSIC_SMOKE)

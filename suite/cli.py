@@ -1,0 +1,340 @@
+"""The `suite` command: parsing and printing only.
+
+Results go to stdout, progress and errors to stderr. Bad input is one line and exit code 2; a run that cannot go on
+is one line and exit code 1; a run that was told to stop exits with 130. Nothing that imports JAX is imported
+before the words of the command are known to be right.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+import statistics
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from suite.errors import RunError, UserError, did_you_mean
+
+if TYPE_CHECKING:
+    from suite.reporting import Reporter
+    from suite.run import Result
+
+COMMANDS = ("run", "list", "describe", "evaluate", "bench")
+LISTS = ("tasks", "agents", "presets")
+BAD_INPUT, FAILED, STOPPED = 2, 1, 130
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the exit code."""
+    try:
+        return _dispatch(sys.argv[1:] if argv is None else list(argv))
+    except (UserError, RunError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return BAD_INPUT if isinstance(error, UserError) else FAILED
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return STOPPED
+    except BrokenPipeError:  # whoever read our output has enough of it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """One line, without the usage."""
+        raise UserError(message)
+
+
+def _dispatch(argv: list[str]) -> int:
+    if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
+        raise UserError(f"unknown command {argv[0]!r}; {did_you_mean(argv[0], COMMANDS)}")
+    parser, commands = _parsers()
+    args, rest = parser.parse_known_args(argv)
+    # argparse takes positional arguments in one go only: settings after an option are left over.
+    options = [word.partition("=")[0] for word in rest if word.startswith("-")]
+    if options:
+        known = re.findall(r"--[a-z]+", commands[args.command].format_help())
+        raise UserError(f"unknown option {options[0]!r}; {did_you_mean(options[0], known)}")
+    if rest and "overrides" not in args:
+        raise UserError(f"unexpected argument {rest[0]!r}")
+    if rest:
+        args.overrides = [*args.overrides, *rest]
+    command = {"run": _run, "list": _list, "describe": _describe, "evaluate": _evaluate, "bench": _bench}[args.command]
+    return command(args)
+
+
+def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
+    parser = _Parser(
+        prog="suite", description="Sample-efficient reinforcement learning with a transformer world model."
+    )
+    sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    summaries = {
+        "run": "train an agent on a task, or go on where the same command stopped",
+        "list": "tasks, agents or presets, one line each",
+        "describe": "the whole configuration, layers and parameter counts, without running anything",
+        "evaluate": "play whole episodes with a run's newest checkpoint",
+        "bench": "time, share and speed of each phase",
+    }
+    commands = {
+        name: sub.add_parser(name, help=summary, description=summary, allow_abbrev=False)
+        for name, summary in summaries.items()
+    }
+    for name in ("run", "describe", "bench"):
+        _add_configuration(commands[name])
+    run = commands["run"]
+    seeds = run.add_mutually_exclusive_group()
+    seeds.add_argument("--seed", type=int, default=0, metavar="N", help="of all randomness (default 0)")
+    seeds.add_argument("--seeds", type=_seeds, metavar="N-M", help="several, one after another: 0-2 or 0,3,5")
+    run.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where records go (default runs)")
+    run.add_argument("--resume", action="store_true", help="fail if there is no run to go on with")
+    commands["list"].add_argument("what", metavar="tasks|agents|presets")
+    commands["evaluate"].add_argument("folder", type=Path, metavar="RUN_DIR")
+    commands["evaluate"].add_argument("--episodes", type=int, metavar="N", help="at least so many")
+    for name in ("run", "evaluate", "bench"):
+        commands[name].add_argument("--quiet", action="store_true", help="no progress")
+    for command in commands.values():
+        command.add_argument("--json", action="store_true", help="the last line of stdout is one JSON object")
+    return parser, commands
+
+
+def _add_configuration(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("task", metavar="TASK", help="see `suite list tasks`")
+    parser.add_argument("--agent", default="m5", metavar="A", help="see `suite list agents` (default m5)")
+    parser.add_argument("--preset", metavar="P", help="see `suite list presets` (default: fit for this machine)")
+    parser.add_argument("--steps", type=int, metavar="N", help="real environment steps (default: the preset's)")
+    parser.add_argument(
+        "overrides", nargs="*", default=[], metavar="dotted.name=value", help="any field that `suite describe` shows"
+    )
+
+
+def _seeds(text: str) -> list[int]:
+    """Seeds of "0-2" or "0,3,5", or of both mixed."""
+    seeds: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        if not first.isdigit() or not (last or first).isdigit() or int(last or first) < int(first):
+            raise argparse.ArgumentTypeError(f"{text!r} is not of the form 0-2 or 0,3,5")
+        seeds += range(int(first), int(last or first) + 1)
+    return list(dict.fromkeys(seeds))
+
+
+def _run(args: argparse.Namespace) -> int:
+    from suite import registry
+    from suite.record import require_writable, run_folder
+
+    seeds = args.seeds or [args.seed]
+    configs = [registry.resolve(args.task, args.agent, args.preset, args.overrides, seed, args.steps) for seed in seeds]
+    require_writable(args.out)
+
+    from suite import run
+
+    results: list[Result] = []
+    for config in configs:
+        if not args.quiet:
+            folder = run_folder(args.out, config)
+            what = f"{config.task}, agent {config.agent}, preset {config.preset}, seed {config.seed}"
+            print(f"{what}, on {_device()}; files in {folder}", flush=True)
+        result = run.run(config, args.out, _reporter(args.quiet), args.resume)
+        results.append(result)
+        _print_result(result)
+        if result.status == "stopped":
+            break
+    stopped = results[-1].status == "stopped"
+    summary = _summary(results)
+    if len(results) > 1:
+        print(f"{len(results)} seeds, mean +- standard error:")
+        for name, (mean, error) in summary.items():
+            print(_score_line(name, mean, error))
+    if args.json:
+        runs = [_result_fields(config.seed, result) for config, result in zip(configs, results, strict=False)]
+        config = configs[0]
+        fields: dict[str, Any] = {"task": config.task, "agent": config.agent, "preset": config.preset}
+        if len(seeds) == 1:
+            fields |= runs[0]
+        else:
+            fields["runs"] = runs
+            fields["mean"] = {name: mean for name, (mean, _) in summary.items()}
+            fields["standard_error"] = {name: error for name, (_, error) in summary.items()}
+        _print_json(fields)
+    return STOPPED if stopped else 0
+
+
+def _list(args: argparse.Namespace) -> int:
+    from suite import registry
+
+    if args.what not in LISTS:
+        raise UserError(f"cannot list {args.what!r}; {did_you_mean(args.what, LISTS)}")
+    entries: dict[str, Any] = getattr(registry, args.what)()
+    rows = {
+        id: [part for part in (entry.summary, getattr(entry, "cost", ""), getattr(entry, "published", "")) if part]
+        for id, entry in entries.items()
+    }
+    if args.json:
+        _print_json(rows)
+    else:
+        _print_table([id, "; ".join(parts)] for id, parts in rows.items())
+    return 0
+
+
+def _describe(args: argparse.Namespace) -> int:
+    from suite import registry
+
+    layers = registry.layers(args.task, args.agent, args.preset, args.overrides, 0, args.steps)
+
+    from suite.describe import describe
+
+    description = describe(layers, registry.task(args.task).spec())
+    if args.json:
+        _print_json(description.as_dict())
+        return 0
+    print("Configuration (value, source)")
+    _print_table([s.name, str(s.value), s.source] for s in description.settings)
+    for module, modules_layers in description.modules.items():
+        unit = "numbers" if module == "codebook" else "parameters"
+        print(f"\n{module.replace('_', ' ').capitalize()}: {description.parameters(module):,} {unit}")
+        _print_table(
+            [
+                layer.name,
+                " ".join(f"{name}{list(shape)}" for name, shape in layer.shapes.items()),
+                f"{layer.parameters:,}",
+            ]
+            for layer in modules_layers
+        )
+    counted = [f"{name.replace('_', ' ')} {description.parameters(name):,}" for name in ("policy", "world_model")]
+    counted.append(f"2 x codebook {description.parameters('codebook'):,} (stored twice in the paper's bookkeeping)")
+    print(f"\nTotal: {description.total:,}", f"= {' + '.join(counted)}" if "codebook" in description.modules else "")
+    print("\nDerived")
+    _print_table([name, f"{value:,}", how] for name, value, how in description.derived)
+    return 0
+
+
+def _evaluate(args: argparse.Namespace) -> int:
+    from suite.record import RunRecord
+
+    if args.episodes is not None and args.episodes < 1:
+        raise UserError(f"--episodes={args.episodes}: must be at least 1")
+    RunRecord.open(args.folder, lock=False)
+
+    from suite import evaluation
+
+    scores = evaluation.evaluate(args.folder, args.episodes, _reporter(args.quiet))
+    for name, value in scores.items():
+        if "/" not in name:
+            print(_score_line(name, value))
+    print(f"record {args.folder}")
+    if args.json:
+        _print_json({"folder": str(args.folder), **scores})
+    return 0
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from suite import registry
+
+    config = registry.resolve(args.task, args.agent, args.preset, args.overrides, 0, args.steps)
+
+    from suite import bench
+
+    if not args.quiet:
+        print(f"{config.task}, agent {config.agent}, preset {config.preset}, on {_device()}", flush=True)
+    measured = bench.bench(config, _reporter(args.quiet))
+    parts = measured if isinstance(measured, Mapping) else {"phases": measured}
+    for name, part in parts.items():
+        if isinstance(part, list):
+            columns = list(dict.fromkeys(column for row in part for column in row))
+            _print_table([columns, *([_value(row.get(column, "")) for column in columns] for row in part)])
+        else:
+            print(f"{name}  {_value(part)}")
+    if args.json:
+        _print_json(parts)
+    return 0
+
+
+def _reporter(quiet: bool) -> Reporter:
+    from suite.reporting import QuietReporter, RichReporter
+
+    return QuietReporter() if quiet else RichReporter()
+
+
+def _device() -> str:
+    import jax
+
+    device = jax.devices()[0]
+    return f"{os.cpu_count()} CPU cores" if device.platform == "cpu" else device.device_kind
+
+
+def _print_result(result: Result) -> None:
+    if result.status == "stopped":
+        print(f"stopped at step {result.steps:,}; the same command goes on from there")
+    elif result.status == "already finished":
+        print("already finished: nothing was run")
+    for name, value in result.scores.items():
+        if "/" not in name:
+            print(_score_line(name, value))
+    print(f"record {result.folder}", flush=True)
+
+
+def _result_fields(seed: int, result: Result) -> dict[str, Any]:
+    return {
+        "seed": seed,
+        "status": result.status,
+        "steps": result.steps,
+        "seconds": result.wall_seconds,
+        "folder": str(result.folder),
+        "scores": result.scores,
+    }
+
+
+def _summary(results: Sequence[Result]) -> dict[str, tuple[float, float]]:
+    """Mean and standard error of each score over finished runs; nan where they say nothing."""
+    scores = [result.scores for result in results if result.status != "stopped"]
+    summary = {}
+    for name in scores[0] if scores else ():
+        values = [float(run[name]) for run in scores]
+        error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+        summary[name] = (statistics.fmean(values), error)
+    return {name: pair for name, pair in summary.items() if "/" not in name}
+
+
+def _score_line(name: str, value: float, error: float | None = None) -> str:
+    """`("reward_percent", 12.34, 0.56)` as "reward 12.34 % +- 0.56 %"."""
+    label, unit = name.removesuffix("_percent").replace("_", " "), " %" if name.endswith("_percent") else ""
+    spread = "" if error is None else f" +- {_value(error)}{unit}"
+    return f"{label} {_value(value)}{unit}{spread}"
+
+
+def _value(value: Any) -> str:
+    """A cell: whole numbers whole, measured ones with two decimals or three digits."""
+    if isinstance(value, bool) or not isinstance(value, float):
+        return str(value)
+    if not math.isfinite(value) or value == int(value):
+        return f"{value:g}"
+    return f"{value:.2f}" if abs(value) >= 1 else f"{value:.3g}"
+
+
+def _print_table(rows: Iterable[Sequence[str]]) -> None:
+    rows = [list(map(str, row)) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  " + "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip())
+
+
+def _print_json(value: Any) -> None:
+    """One line; nan becomes null, for JSON has none."""
+    print(json.dumps(_finite(value), allow_nan=False, default=float), flush=True)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _finite(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

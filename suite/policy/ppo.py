@@ -1,0 +1,271 @@
+"""Proximal policy optimisation on a batch of trajectories, real or imagined (Appendix A.1.2, Algorithm 3).
+
+Shapes: T steps, B environments, A actions, H memory units. In two-player games a step is an event; only where
+`acting_TB` is the decision ours. Other events pass their rewards back to our decision before them.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx, struct
+
+from suite.config import PPOConfig
+from suite.policy.actor_critic import PolicyOutput, log_probability, mask_logits
+
+
+@struct.dataclass
+class Trajectory:
+    """T steps of B environments, as they were played.
+
+    Attributes:
+      observation_TB: uint8 [T, B, ...]; what was acted on.
+      action_TB: int32.
+      reward_TB: float32, of the step taken at t.
+      terminated_TB, truncated_TB: bool; the step taken at t ended the episode.
+      first_TB: bool; `observation_TB[t]` opens an episode.
+      log_probability_TB: float32, of the action when it was taken.
+      value_TB: float32, of the observation, in units of reward.
+      hidden_BH: float32, the memory before t = 0.
+      last_value_B: float32, of the observation after the last step, in units of reward.
+      truncation_value_TB: float32, of the last observation of a truncated episode, in units of reward; else 0.
+      acting_TB: bool; our decisions. None: all are.
+      legal_TBA: bool; None: every action is legal.
+    """
+
+    observation_TB: jax.Array
+    action_TB: jax.Array
+    reward_TB: jax.Array
+    terminated_TB: jax.Array
+    truncated_TB: jax.Array
+    first_TB: jax.Array
+    log_probability_TB: jax.Array
+    value_TB: jax.Array
+    hidden_BH: jax.Array
+    last_value_B: jax.Array
+    truncation_value_TB: jax.Array
+    acting_TB: jax.Array | None = None
+    legal_TBA: jax.Array | None = None
+
+
+def generalized_advantages(trajectory: Trajectory, discount: float, gae_lambda: float) -> jax.Array:
+    """Generalised advantage estimates [T, B] (Appendix A.1.2), 0 where the decision is not ours.
+
+    `discount` and `gae_lambda` count our decisions, not events. Termination is worth nothing beyond; a truncation
+    has the value of its last observation beyond, and the trace ends at both.
+    """
+    acting_TB = trajectory.acting_TB
+    if acting_TB is None:
+        acting_TB = jnp.ones_like(trajectory.terminated_TB)
+
+    def step(carry, inputs):
+        next_value_B, next_advantage_B, pending_B = carry
+        reward_B, value_B, terminated_B, truncated_B, truncation_value_B, acting_B = inputs
+        ended_B = terminated_B | truncated_B
+        beyond_B = jnp.where(terminated_B, 0.0, truncation_value_B)
+        next_value_B = jnp.where(ended_B, beyond_B, next_value_B)
+        next_advantage_B = jnp.where(ended_B, 0.0, next_advantage_B)
+        reward_B = reward_B + jnp.where(ended_B, 0.0, pending_B)
+        error_B = reward_B + discount * next_value_B - value_B
+        advantage_B = error_B + discount * gae_lambda * next_advantage_B
+        ours = (value_B, advantage_B, jnp.zeros_like(reward_B))
+        theirs = (next_value_B, next_advantage_B, reward_B)
+        carry = jax.tree.map(lambda a, b: jnp.where(acting_B, a, b), ours, theirs)
+        return carry, jnp.where(acting_B, advantage_B, 0.0)
+
+    zeros_B = jnp.zeros_like(trajectory.last_value_B)
+    inputs = (
+        trajectory.reward_TB,
+        trajectory.value_TB,
+        trajectory.terminated_TB,
+        trajectory.truncated_TB,
+        trajectory.truncation_value_TB,
+        acting_TB,
+    )
+    _, advantage_TB = jax.lax.scan(step, (trajectory.last_value_B, zeros_B, zeros_B), inputs, reverse=True)
+    return advantage_TB
+
+
+@struct.dataclass
+class TargetStatistics:
+    """Moving averages that standardise value targets (Algorithm 3, fidelity notes 8 and 9).
+
+    `mean`, `std` and `weight` (float32 scalars) all average from zero; dividing by `weight`, the average of ones,
+    removes the bias towards zero. Before the first update the statistics are mean 0 and deviation 1.
+    """
+
+    mean: jax.Array
+    std: jax.Array
+    weight: jax.Array
+    min_std: float = struct.field(pytree_node=False, default=0.1)
+
+    @classmethod
+    def create(cls, min_std: float = 0.1) -> TargetStatistics:
+        """Statistics of nothing yet; `min_std` is the floor of the standard deviation."""
+        zero = jnp.zeros((), jnp.float32)
+        return cls(mean=zero, std=zero, weight=zero, min_std=min_std)
+
+    def update(self, targets: jax.Array, mask: jax.Array | None, decay: float) -> TargetStatistics:
+        """Takes in the mean and standard deviation of `targets` where `mask`; a mask of nothing changes nothing."""
+        mean, std, count = _moments(targets, mask)
+        keep = jnp.where(count > 0, decay, 1.0)
+        return self.replace(
+            mean=keep * self.mean + (1.0 - keep) * mean,
+            std=keep * self.std + (1.0 - keep) * std,
+            weight=keep * self.weight + (1.0 - keep),
+        )
+
+    def corrected(self) -> tuple[jax.Array, jax.Array]:
+        """Mean and standard deviation in use."""
+        seen = self.weight > 0
+        weight = jnp.where(seen, self.weight, 1.0)
+        return self.mean / weight, jnp.where(seen, jnp.maximum(self.std / weight, self.min_std), 1.0)
+
+    def standardize(self, targets: jax.Array) -> jax.Array:
+        """From units of reward to those that the value network predicts."""
+        mean, std = self.corrected()
+        return (targets - mean) / std
+
+    def denormalize(self, value: jax.Array) -> jax.Array:
+        """From the value network's units to those of reward."""
+        mean, std = self.corrected()
+        return value * std + mean
+
+
+@struct.dataclass
+class Learner:
+    """All that learning a policy carries along: parameters, optimizer state, target statistics."""
+
+    params: nnx.State
+    optimizer: optax.OptState
+    targets: TargetStatistics
+
+    @classmethod
+    def create(cls, ppo: PPOConfig, optimizer: optax.GradientTransformation, params: nnx.State) -> Learner:
+        """A fresh learner of `params`, the state of `nnx.split(policy)`."""
+        return cls(params, optimizer.init(params), TargetStatistics.create(ppo.target_min_std))
+
+
+def make_optimizer(ppo: PPOConfig, total_updates: int | None) -> optax.GradientTransformation:
+    """Adam behind gradient clipping; the rate falls linearly to 0 over `total_updates` minibatches if given."""
+    rate = optax.linear_schedule(ppo.learning_rate, 0.0, total_updates) if total_updates else ppo.learning_rate
+    return optax.chain(optax.clip_by_global_norm(ppo.max_grad_norm), optax.adam(rate, eps=ppo.adam_eps))
+
+
+def update(
+    ppo: PPOConfig,
+    optimizer: optax.GradientTransformation,
+    graphdef: nnx.GraphDef,
+    learner: Learner,
+    trajectory: Trajectory,
+    *,
+    epochs: int,
+    minibatches: int,
+    entropy_coefficient: float,
+) -> tuple[Learner, dict[str, jax.Array]]:
+    """Algorithm 3: `epochs` passes over `minibatches` contiguous groups of environments, unshuffled (note 9).
+
+    Each minibatch runs the network over all T steps again, from `trajectory.hidden_BH`. `minibatches` must divide
+    B. Returns the learner and float32 scalar metrics, those of the loss averaged over all minibatch updates.
+    """
+    advantage_TB = generalized_advantages(trajectory, ppo.discount, ppo.gae_lambda)
+    mean, std, _ = _moments(advantage_TB, trajectory.acting_TB)
+    batch = _Batch(
+        observation_TB=trajectory.observation_TB,
+        first_TB=trajectory.first_TB,
+        action_TB=trajectory.action_TB,
+        log_probability_TB=trajectory.log_probability_TB,
+        advantage_TB=(advantage_TB - mean) / (std + 1e-8),
+        target_TB=advantage_TB + trajectory.value_TB,
+        acting_TB=trajectory.acting_TB,
+        legal_TBA=trajectory.legal_TBA,
+    )
+    size = trajectory.hidden_BH.shape[0] // minibatches
+
+    def minibatch_update(learner: Learner, index: jax.Array):
+        part, hidden_BH = _environments(batch, trajectory.hidden_BH, index * size, size)
+        targets = learner.targets.update(part.target_TB, part.acting_TB, ppo.target_decay)
+        part = part.replace(target_TB=targets.standardize(part.target_TB))
+
+        def loss_of(params: nnx.State):
+            policy = nnx.merge(graphdef, params)
+            output, _ = policy(part.observation_TB, part.first_TB, hidden_BH, part.acting_TB)
+            return _loss(ppo, output, part, entropy_coefficient)
+
+        gradients, metrics = jax.grad(loss_of, has_aux=True)(learner.params)
+        metrics["gradient_norm"] = optax.global_norm(gradients)
+        changes, state = optimizer.update(gradients, learner.optimizer, learner.params)
+        return Learner(optax.apply_updates(learner.params, changes), state, targets), metrics
+
+    order = jnp.tile(jnp.arange(minibatches), epochs)
+    learner, metrics = jax.lax.scan(minibatch_update, learner, order)
+    metrics = {name: value.mean() for name, value in metrics.items()}
+
+    _, target_std, _ = _moments(batch.target_TB, trajectory.acting_TB)
+    metrics["explained_variance"] = 1.0 - jnp.square(std) / (jnp.square(target_std) + 1e-8)
+    metrics["target_mean"], metrics["target_std"] = learner.targets.corrected()
+    return learner, metrics
+
+
+@struct.dataclass
+class _Batch:
+    """What the loss needs of each step; `advantage_TB` is standardised, `target_TB` q = A + v."""
+
+    observation_TB: jax.Array
+    first_TB: jax.Array
+    action_TB: jax.Array
+    log_probability_TB: jax.Array
+    advantage_TB: jax.Array
+    target_TB: jax.Array
+    acting_TB: jax.Array | None
+    legal_TBA: jax.Array | None
+
+
+def _environments(batch: _Batch, hidden_BH: jax.Array, start: jax.Array, size: int) -> tuple[_Batch, jax.Array]:
+    """Environments [start, start + size) of both. A slice inside the loop, so that no second copy is made."""
+    part = jax.tree.map(lambda x_TB: jax.lax.dynamic_slice_in_dim(x_TB, start, size, axis=1), batch)
+    return part, jax.lax.dynamic_slice_in_dim(hidden_BH, start, size, axis=0)
+
+
+def _loss(
+    ppo: PPOConfig, output: PolicyOutput, batch: _Batch, entropy_coefficient: float
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """The objective of Appendix A.1.2 as a mean over our decisions (note 10), and its parts."""
+    log_policy_TBA = jax.nn.log_softmax(mask_logits(output.logits_TBA, batch.legal_TBA))
+    log_ratio_TB = log_probability(log_policy_TBA, batch.action_TB) - batch.log_probability_TB
+    if batch.acting_TB is not None:
+        # Someone else's event may be an action that we never take: keep its ratio finite.
+        log_ratio_TB = jnp.where(batch.acting_TB, log_ratio_TB, 0.0)
+    ratio_TB = jnp.exp(log_ratio_TB)
+    clipped_TB = jnp.clip(ratio_TB, 1.0 - ppo.clip, 1.0 + ppo.clip)
+    gain_TB = jnp.minimum(ratio_TB * batch.advantage_TB, clipped_TB * batch.advantage_TB)
+    entropy_TB = -(jnp.exp(log_policy_TBA) * log_policy_TBA).sum(-1)
+    parts_TB = {
+        "policy_loss": -gain_TB,
+        "value_loss": jnp.square(output.value_TB - batch.target_TB),
+        "entropy": entropy_TB,
+        "approx_kl": ratio_TB - 1.0 - log_ratio_TB,
+        "clip_fraction": (jnp.abs(ratio_TB - 1.0) > ppo.clip).astype(jnp.float32),
+    }
+    metrics = {name: _mean(part_TB, batch.acting_TB) for name, part_TB in parts_TB.items()}
+    loss = (
+        metrics["policy_loss"]
+        + ppo.value_coefficient * metrics["value_loss"]
+        - entropy_coefficient * metrics["entropy"]
+    )
+    return loss, metrics
+
+
+def _mean(x: jax.Array, mask: jax.Array | None) -> jax.Array:
+    """Mean of `x` where `mask` (None: everywhere); 0 of nothing."""
+    if mask is None:
+        return x.mean()
+    return jnp.where(mask, x, 0.0).sum() / jnp.maximum(mask.sum().astype(x.dtype), 1.0)
+
+
+def _moments(x: jax.Array, mask: jax.Array | None) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean, standard deviation and number of entries of `x` where `mask` (None: everywhere)."""
+    mean = _mean(x, mask)
+    count = jnp.asarray(x.size) if mask is None else mask.sum()
+    return mean, jnp.sqrt(_mean(jnp.square(x - mean), mask)), count

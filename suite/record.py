@@ -1,0 +1,412 @@
+"""The run record: one folder per run, from which every score can be recomputed. Nothing in it is ever overwritten.
+
+`runs/<task>/<agent>/<preset>/seed_<n>/` holds
+
+    config.json       the whole configuration
+    record.json       what ran where: task, agent, preset, seed, protocol, versions, device, times, status
+    episodes.csv      one row per real training episode
+    metrics.csv       one row per iteration
+    evaluations.csv   one row per evaluation episode; never mixed with training's
+    timing.csv        seconds per phase, one row per iteration
+    tensorboard/      the metrics as curves
+    checkpoints/      see `suite.checkpoint`
+    replaced/         rows of iterations that a resumed run played again
+
+No clock enters episodes.csv and metrics.csv, so that a run that was stopped and resumed writes the same bytes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import errno
+import fcntl
+import importlib.metadata
+import json
+import os
+import platform
+import resource
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from suite import registry
+from suite.config import Config, hash_of
+from suite.errors import RunError, UserError
+from suite.overrides import dotted
+from suite.tables import Table, write_whole
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from suite.interface.environment import EnvironmentSpec
+
+SCHEMA = 1
+PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "flashbax", "numpy", "world-model-suite")
+
+
+def run_folder(out: Path, config: Config) -> Path:
+    """Where a run's record lies under `out`."""
+    return out / config.task / config.agent / config.preset / f"seed_{config.seed}"
+
+
+def require_writable(folder: Path) -> None:
+    """Creates `folder` if it is not there.
+
+    Raises:
+      UserError: it cannot be created or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".writable.{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
+
+
+@contextlib.contextmanager
+def disk_full_is_an_error() -> Iterator[None]:
+    """Turns a full disk, wherever inside it is noticed, into a `RunError`."""
+    try:
+        yield
+    except Exception as error:
+        if not _says_disk_full(error):
+            raise
+        raise RunError(
+            "disk full; the last checkpoint is intact: free some space and run the same command again"
+        ) from error
+
+
+def _says_disk_full(error: BaseException | None) -> bool:
+    """Also where a library wraps the system's error, or only quotes it."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        if os.strerror(errno.ENOSPC) in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def protocol(config: Config, spec: EnvironmentSpec) -> dict[str, Any]:
+    """What must be equal for two results to be compared: budget, scoring, task, and the version of its rules."""
+    return {
+        "task": config.task,
+        "steps": config.protocol.steps,
+        "final_fraction": config.protocol.final_fraction,
+        "package": spec.package,
+        "package_version": _version(spec.package) if spec.package else "",
+    }
+
+
+class RunRecord:
+    """A run's folder, open. At most one process has it open for writing.
+
+    Attributes:
+      folder: where it lies.
+      config: the run's configuration.
+      fields: the content of record.json.
+    """
+
+    def __init__(
+        self, folder: Path, config: Config, fields: dict[str, Any], spec: EnvironmentSpec | None, lock: IO[str] | None
+    ):
+        """Use `create`, `open` or `open_or_create`."""
+        self.folder, self.config, self.fields, self._lock = folder, config, fields, lock
+        self._spec = spec
+        self._tables = {
+            name: Table(folder / f"{name}.csv", columns) for name, columns in fields["columns"].items() if lock
+        }
+        self._events: Any = None
+        self._purge_step: int | None = None
+
+    @classmethod
+    def create(cls, folder: Path, config: Config, spec: EnvironmentSpec) -> RunRecord:
+        """Starts the record of a new run.
+
+        Raises:
+          UserError: the folder cannot be written, is in use, or holds a run already.
+        """
+        require_writable(folder)
+        lock = _acquire(folder)
+        taken = [path for path in (folder / "record.json", *folder.glob("*.csv")) if path.exists()]
+        if taken:
+            lock.close()
+            raise UserError(f"{folder} already holds {taken[0].name}; choose another --out")
+        rules = protocol(config, spec)
+        scalars = [name for name, shape in spec.statistics if shape == ()]
+        fields = {
+            "schema": SCHEMA,
+            "task": config.task,
+            "agent": config.agent,
+            "preset": config.preset,
+            "seed": config.seed,
+            "config_digest": config.digest(),
+            "protocol": rules,
+            "protocol_hash": hash_of(rules),
+            "max_return": spec.max_return,
+            "achievements": list(spec.achievements),
+            "columns": {
+                "episodes": ["step", "return", "length", *scalars, *spec.achievements],
+                "evaluations": ["step", "return", "length", *scalars, *spec.achievements],
+                "metrics": None,  # those of the first row
+                "timing": None,
+            },
+            "status": "running",
+            "steps": 0,
+            "started": _now(),
+            "ended": None,
+            "wall_clock_seconds": {"total": 0.0},
+            "peak_memory_bytes": {},
+            **_surroundings(),
+            "resumed": [],
+        }
+        _write_json(folder / "config.json", config.as_dict())
+        _write_json(folder / "record.json", fields)  # last: a folder is a run from here on
+        return cls(folder, config, fields, spec, lock)
+
+    @classmethod
+    def open(
+        cls, folder: Path, config: Config | None = None, spec: EnvironmentSpec | None = None, lock: bool = True
+    ) -> RunRecord:
+        """Opens an existing record.
+
+        Args:
+          folder: the run's folder.
+          config: what the run is expected to be; None: whatever it is.
+          spec: the task's, to compare the protocol with; None: not compared.
+          lock: for writing; without it, only for reading.
+
+        Raises:
+          UserError: no run folder, another schema, damaged, another run than expected, or in use.
+        """
+        fields = _read_json(folder, "record.json")
+        if fields.get("schema") != SCHEMA:
+            raise UserError(f"{folder} has a record of schema {fields.get('schema')}; this version reads {SCHEMA}")
+        try:
+            stored = Config(**_read_json(folder, "config.json"))
+        except (TypeError, ValueError) as error:
+            raise UserError(f"{folder}/config.json is not of this version: {str(error).splitlines()[0]}") from error
+        if config is not None:
+            _require_same_run(folder, stored, config)
+        if config is not None and spec is not None and fields["protocol"] != protocol(config, spec):
+            raise UserError(
+                f"{folder} was started with {spec.package} {fields['protocol']['package_version']}, not with the "
+                f"installed {_version(spec.package)}; choose another --out"
+            )
+        return cls(folder, config or stored, fields, spec, _acquire(folder) if lock else None)
+
+    @classmethod
+    def open_or_create(cls, folder: Path, config: Config, spec: EnvironmentSpec) -> RunRecord:
+        """The record of this very run, begun or new; errors as `open` and `create`."""
+        if (folder / "record.json").exists():
+            return cls.open(folder, config, spec)
+        return cls.create(folder, config, spec)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run took all its steps."""
+        return self.fields["status"] == "finished"
+
+    @property
+    def steps(self) -> int:
+        """Real environment steps recorded so far."""
+        return self.fields["steps"]
+
+    @property
+    def wall_seconds(self) -> float:
+        """Seconds that the run took, over all processes that worked on it."""
+        return self.fields["wall_clock_seconds"]["total"]
+
+    @property
+    def spec(self) -> EnvironmentSpec:
+        """The task's specification."""
+        return self._spec or registry.task(self.config.task).spec()
+
+    def append_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Adds training episodes, in the order in which they ended.
+
+        Each row has `step` (real steps of the run when it ended), `return`, `length`, the task's scalar statistics,
+        and 0 or 1 for each achievement, all by name.
+        """
+        self._tables["episodes"].append(rows)
+
+    def append_evaluation(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Adds evaluation episodes: as `append_episodes`, `step` being that of the checkpoint."""
+        self._tables["evaluations"].append(rows)
+
+    def append_metrics(self, row: Mapping[str, Any], names: Iterable[str] = ()) -> None:
+        """Adds one iteration's metrics, `step` first.
+
+        The first row fixes the columns: its own and `names`, those that later rows may have. What a row lacks, or
+        has as None, stays empty.
+        """
+        from suite.event_files import EventFile
+
+        self._tables["metrics"].append([row], names)
+        self.fields["steps"] = int(row["step"])
+        if self._events is None:
+            self._events = EventFile(self.folder / "tensorboard", self._purge_step)
+        numbers = {name: float(value) for name, value in row.items() if value is not None and name != "step"}
+        self._events.append(int(row["step"]), numbers)
+
+    def append_timing(self, row: Mapping[str, Any]) -> None:
+        """Adds one iteration's seconds per phase, `step` first. The first row fixes the columns."""
+        self._tables["timing"].append([row])
+
+    def rewind(self, step: int) -> int:
+        """Goes back to a checkpoint: rows beyond `step` move to `replaced/`. Returns how many did.
+
+        The run plays those steps again, identically. What TensorBoard shows of them is replaced as well.
+        """
+        folders = self.folder / "replaced"
+        number = 1 + sum(1 for _ in folders.glob("*"))
+        aside = folders / f"{number:04d}_after_step_{step}"
+        moved = 0
+        for name, columns in self.fields["columns"].items():
+            moved += self._tables[name].rewind(step, aside / f"{name}.csv")
+            self._tables[name] = Table(self.folder / f"{name}.csv", columns)
+        self._purge_step = step + 1
+        self.update(steps=step, resumed=[*self.fields["resumed"], {"step": step, "date": _now(), **_surroundings()}])
+        return moved
+
+    def update(self, **fields: Any) -> None:
+        """Replaces fields of record.json."""
+        if unknown := fields.keys() - self.fields.keys():
+            raise ValueError(f"record.json has no field {', '.join(sorted(unknown))}")
+        self.fields |= fields
+        _write_json(self.folder / "record.json", self.fields)
+
+    def add_wall_clock(self, seconds: float, phases: Mapping[str, float]) -> None:
+        """Notes the time that this process took, and each phase's over all processes; and the peak memory so far."""
+        peaks = _peak_memory()
+        before = self.fields["peak_memory_bytes"]
+        self.update(
+            wall_clock_seconds={**phases, "total": self.wall_seconds + seconds},
+            peak_memory_bytes={name: max(peak, before.get(name, 0)) for name, peak in peaks.items()},
+        )
+
+    def finish(self, steps: int) -> None:
+        """Marks the run as finished."""
+        self.update(status="finished", steps=steps, ended=_now())
+
+    def episodes(self) -> pd.DataFrame:
+        """The training episodes; see `leaderboards.scoring`."""
+        import pandas as pd
+
+        try:
+            return pd.read_csv(self.folder / "episodes.csv")
+        except (OSError, ValueError) as error:
+            raise UserError(f"cannot read {self.folder}/episodes.csv: {error}") from error
+
+    def close(self) -> None:
+        """Lets other processes open the folder."""
+        if self._events is not None:
+            self._events.close()
+            self._events = None
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def __enter__(self) -> RunRecord:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+def _acquire(folder: Path) -> IO[str]:
+    """The exclusive lock on a folder, held until the file is closed or its process ends, however it ends."""
+    try:
+        file = (folder / "run.lock").open("a+")
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.seek(0)
+        owner = file.read().strip()
+        file.close()
+        raise UserError(f"{folder} is in use by another process ({owner or 'just started'})") from None
+    file.truncate(0)
+    file.write(f"pid {os.getpid()} on {platform.node()}")
+    file.flush()
+    return file
+
+
+def _require_same_run(folder: Path, stored: Config, asked: Config) -> None:
+    old, new = dotted(stored), dotted(asked)
+    for name in new:
+        if old[name] != new[name] and not name.startswith("checkpoint."):
+            raise UserError(f"{folder} holds a run with {name}={old[name]}, not {new[name]}; choose another --out")
+
+
+def _surroundings() -> dict[str, Any]:
+    """What else the result may depend on."""
+    import jax
+
+    device = jax.devices()[0]
+    return {
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in PACKAGES},
+        "git_commit": _git_commit(),
+        "device": {"platform": device.platform, "kind": device.device_kind, "cpu_cores": os.cpu_count()},
+    }
+
+
+def _peak_memory() -> dict[str, int]:
+    """Bytes: of this process, and of the device where it has memory of its own."""
+    import jax
+
+    peaks = {"process": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024}  # Linux counts in KiB
+    statistics = jax.devices()[0].memory_stats() or {}
+    if "peak_bytes_in_use" in statistics:
+        peaks["device"] = statistics["peak_bytes_in_use"]
+    return peaks
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _git_commit() -> str | None:
+    """The commit of the code that runs, "-dirty" if it was changed since; None if it is no checkout."""
+    here = Path(__file__)
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(here.parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", here.name)  # or an installed copy inside someone else's checkout
+        return git("describe", "--always", "--abbrev=40", "--exclude=*", "--dirty")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+def _write_json(path: Path, value: Any) -> None:
+    write_whole(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def _read_json(folder: Path, name: str) -> dict[str, Any]:
+    path = folder / name
+    try:
+        value = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise UserError(f"{folder} is no run folder: it has no {name}") from None
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise UserError(f"{path} is damaged: {error}") from error
+    if not isinstance(value, dict):
+        raise UserError(f"{path} is damaged: not an object")
+    return value

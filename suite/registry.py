@@ -1,0 +1,249 @@
+"""Ids to tasks, agents and presets, all imported lazily, and the configuration that they make together.
+
+Other distributions add theirs by entry points: groups `suite.tasks` and `suite.agents`, each naming a `TaskEntry` or
+an `AgentEntry`. This module imports neither JAX nor any game.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.metadata
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+from suite.config import Config
+from suite.errors import UserError, did_you_mean
+from suite.overrides import apply_changes, parse_overrides
+
+Source = Literal["default", "preset", "agent", "user"]
+Transform = Callable[[Config], Config]
+
+
+@dataclasses.dataclass(frozen=True)
+class Lazy:
+    """Something at "module:name", imported when it is asked for."""
+
+    reference: str
+
+    def __call__(self) -> Any:
+        """Imports it."""
+        module, name = self.reference.split(":")
+        return getattr(importlib.import_module(module), name)
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskEntry:
+    """A task: where its parts are, without importing them.
+
+    Attributes:
+      id: `family` or `family/name`.
+      family: what its tasks share: rules, scoring, presets.
+      summary: one line.
+      spec: an `EnvironmentSpec`.
+      make: a function that builds the environment; its `progress: Callable[[str, float], None] | None` is told of
+        preparations that take long.
+      scores: a function of (episodes, configuration or None, specification) to numbers by name; None: all episodes
+        count alike, as in an evaluation.
+      presets: by name, functions `Config -> Config`; they see the agent's id in `config.agent`.
+      cost: what a run takes, in words.
+    """
+
+    id: str
+    family: str
+    summary: str
+    spec: Lazy
+    make: Lazy
+    scores: Lazy
+    presets: Mapping[str, Lazy]
+    cost: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class AgentEntry:
+    """An agent: a function `Config -> Config` that states what defines it.
+
+    Attributes:
+      published: reward and score in percent as published for Craftax-classic at 1M steps, "" if there are none.
+    """
+
+    id: str
+    configure: Lazy
+    summary: str
+    published: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class PresetEntry:
+    """A preset's name and purpose; what it changes belongs to each task (`TaskEntry.presets`)."""
+
+    id: str
+    summary: str
+
+
+TASKS = (
+    TaskEntry(
+        id="craftax_classic",
+        family="craftax_classic",
+        summary="Craftax-classic from 63x63 pixels: 17 actions, 22 achievements",
+        spec=Lazy("adapters.craftax:CLASSIC_SPEC"),
+        make=Lazy("adapters.craftax:make_classic"),
+        scores=Lazy("leaderboards.scoring:craftax"),
+        presets={
+            "paper": Lazy("baselines.presets:paper"),
+            "small": Lazy("baselines.presets:craftax_classic_small"),
+            "smoke": Lazy("baselines.presets:craftax_classic_smoke"),
+        },
+        cost="small: minutes on two CPU cores; paper: an accelerator",
+    ),
+)
+
+AGENTS = (
+    AgentEntry("random", Lazy("baselines.random_policy:random"), "uniform over actions, learns nothing"),
+    AgentEntry(
+        "mfrl",
+        Lazy("baselines.model_free:mfrl"),
+        "PPO with a GRU on real play only",
+        published="reward 55.49 +- 1.33 %, score 16.77 +- 1.11 %",
+    ),
+    AgentEntry(
+        "m5",
+        Lazy("baselines.ladder:m5"),
+        "PPO on real and imagined play: nearest-neighbor tokens, block teacher forcing",
+        published="reward 67.42 +- 0.55 %, score 27.91 +- 0.63 %",
+    ),
+    AgentEntry(
+        "m5_slow",
+        Lazy("baselines.ladder:m5_slow"),
+        "m5 with eight times the world-model updates",
+        published="reward 69.66 %, score 31.77 %",
+    ),
+)
+
+PRESETS = (
+    PresetEntry("paper", "the paper's Appendix A; only these results are ranked (default on an accelerator)"),
+    PresetEntry("small", "scaled down so that two CPU cores learn something in minutes (default on a CPU)"),
+    PresetEntry("smoke", "two iterations within seconds, for tests; learns nothing"),
+)
+
+
+def tasks() -> dict[str, TaskEntry]:
+    """Every task by id, those of other distributions included."""
+    return _with_plugins(TASKS, "suite.tasks", TaskEntry)
+
+
+def agents() -> dict[str, AgentEntry]:
+    """Every agent by id, those of other distributions included."""
+    return _with_plugins(AGENTS, "suite.agents", AgentEntry)
+
+
+def presets() -> dict[str, PresetEntry]:
+    """Every preset by name."""
+    return {entry.id: entry for entry in PRESETS}
+
+
+def task(id: str) -> TaskEntry:
+    """The task of this id.
+
+    Raises:
+      UserError: there is none.
+    """
+    return _find("task", id, tasks())
+
+
+def agent(id: str) -> AgentEntry:
+    """The agent of this id.
+
+    Raises:
+      UserError: there is none.
+    """
+    return _find("agent", id, agents())
+
+
+def resolve(
+    task: str,
+    agent: str = "m5",
+    preset: str | None = None,
+    overrides: Sequence[str] = (),
+    seed: int = 0,
+    steps: int | None = None,
+) -> Config:
+    """The complete configuration of a run.
+
+    Args:
+      task: a task's id.
+      agent: an agent's id.
+      preset: a preset's name; None: "paper" where there is an accelerator, else "small".
+      overrides: the user's "dotted.name=value", the last word on every field.
+      seed: of all randomness.
+      steps: real environment steps; None: the preset's.
+
+    Raises:
+      UserError: an unknown id, field or value, or values that do not fit each other.
+    """
+    return layers(task, agent, preset, overrides, seed, steps)[-1][1]
+
+
+def layers(
+    task: str,
+    agent: str = "m5",
+    preset: str | None = None,
+    overrides: Sequence[str] = (),
+    seed: int = 0,
+    steps: int | None = None,
+) -> list[tuple[Source, Config]]:
+    """As `resolve`, with the configuration after each source's changes; the last is the run's."""
+    task_entry, agent_entry = _find("task", task, tasks()), _find("agent", agent, agents())
+    changes = parse_overrides(overrides)
+    if steps is not None:
+        changes["protocol.steps"] = steps
+    if preset is not None and preset not in task_entry.presets:
+        _find("preset", preset, dict.fromkeys(task_entry.presets))
+    if preset is None:
+        preset = "paper" if _on_accelerator() and "paper" in task_entry.presets else "small"
+    start = apply_changes(Config(task=task, agent=agent, preset=preset), {"seed": seed})
+    configs: list[tuple[Source, Config]] = [("default", _with_compute_type(start))]
+    transforms: tuple[tuple[Source, Transform], ...] = (
+        ("preset", task_entry.presets[preset]()),
+        ("agent", agent_entry.configure()),  # after the preset: what defines an agent holds at any size
+        ("user", lambda config: _with_compute_type(apply_changes(config, changes))),
+    )
+    for source, transform in transforms:
+        configs.append((source, transform(configs[-1][1])))
+    return configs
+
+
+def _on_accelerator() -> bool:
+    import jax
+
+    return jax.default_backend() != "cpu"
+
+
+def _with_compute_type(config: Config) -> Config:
+    """Makes "auto" concrete, so that records show what was computed in."""
+    changes = {
+        f"{part}.compute_type": "bfloat16" if _on_accelerator() else "float32"
+        for part in ("policy", "world_model")
+        if getattr(config, part).compute_type == "auto"
+    }
+    return apply_changes(config, changes)
+
+
+def _find(kind: str, id: str, entries: Mapping[str, Any]) -> Any:
+    if id not in entries:
+        raise UserError(f"unknown {kind} {id!r}; {did_you_mean(id, entries)}")
+    return entries[id]
+
+
+def _with_plugins(own: tuple[Any, ...], group: str, kind: type) -> dict[str, Any]:
+    """Entries by id; ours cannot be replaced by another distribution's."""
+    found = {}
+    for point in importlib.metadata.entry_points(group=group):
+        try:
+            entry = point.load()
+        except Exception as error:  # whatever another distribution's module raises
+            raise UserError(f"entry point {point.name!r} of {group} cannot be loaded: {error}") from error
+        if not isinstance(entry, kind):
+            raise UserError(f"entry point {point.name!r} of {group} is no {kind.__name__}")
+        found[entry.id] = entry
+    return {entry.id: entry for entry in own} | {id: e for id, e in found.items() if id not in {o.id for o in own}}

@@ -1,0 +1,146 @@
+"""The nearest-neighbor tokenizer: a codebook of patches that grows, and never changes (Section 3.5, Eq. 1).
+
+Distances are exact. Patches are integers of 0..high, and while h*w*C * high**2 < 2**24 every product and partial sum of
+a float32 matrix product of them is an integer that float32 holds: the order of summation does not matter, a stored
+patch is at distance 0 from its code, and every device chooses the same code. (Craftax: 147 * 255**2 = 0.57 * 2**24.)
+Beyond that bound a distance is off by a few parts in 2**24 of the patch's squared norm.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from suite.interface.environment import ObservationSpec
+from suite.tokenizers.patches import join_patches, patch_grid, split_patches
+
+CHUNK_DISTANCES = 2**24  # distances held at once: 64 MiB
+
+
+@struct.dataclass
+class NearestNeighborState:
+    """The codebook.
+
+    Attributes:
+      codes_KP: uint8; stored patches as seen, the first `count` of them meaningful.
+      count: int32 scalar.
+    """
+
+    codes_KP: jax.Array
+    count: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class NearestNeighborTokenizer:
+    """A `Tokenizer` whose codes are patches that were seen (fidelity note 13).
+
+    Attributes:
+      codebook_size: K; a full codebook stops growing.
+      threshold: squared Euclidean distance, of patches scaled to [0, 1], above which a patch becomes a code.
+      patch: (height, width) of a patch; must fill the frame exactly, else ValueError.
+      observation: the frames, of kind "pixels" or "grid".
+    """
+
+    codebook_size: int
+    threshold: float
+    patch: tuple[int, int]
+    observation: ObservationSpec
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """(rows, columns) of tokens in a frame."""
+        return patch_grid(self.observation.shape, self.patch)
+
+    @property
+    def tokens_per_frame(self) -> int:
+        """L."""
+        return math.prod(self.grid)
+
+    @property
+    def num_codes(self) -> int:
+        """K."""
+        return self.codebook_size
+
+    def init(self, key: jax.Array) -> NearestNeighborState:
+        """An empty codebook; `key` is not used."""
+        del key
+        size = math.prod(self.patch) * self.observation.shape[-1]
+        return NearestNeighborState(jnp.zeros((self.codebook_size, size), jnp.uint8), jnp.int32(0))
+
+    def update(
+        self, state: NearestNeighborState, observation_NO: jax.Array
+    ) -> tuple[NearestNeighborState, dict[str, jax.Array]]:
+        """Examines every patch in order and stores those farther than `threshold` from all codes before them.
+
+        Equal to examining them one after another, at the price of one iteration per new code. Metrics: `codes`,
+        `new_codes`, `mean_distance` and `max_distance` (squared, of all patches to their nearest code afterwards).
+        """
+        patches_MP = split_patches(observation_NO, self.patch).reshape(-1, state.codes_KP.shape[-1])
+        distance_M, _ = self._nearest(state, patches_MP)
+        limit = jnp.float32(self.threshold * self.observation.high**2)
+        values_MP = patches_MP.astype(jnp.float32)
+        norm_M = _squared_norm(values_MP)
+
+        def growing(carry: tuple[NearestNeighborState, jax.Array]) -> jax.Array:
+            state, distance_M = carry
+            return (state.count < self.codebook_size) & jnp.any(distance_M > limit)
+
+        def grow(carry: tuple[NearestNeighborState, jax.Array]) -> tuple[NearestNeighborState, jax.Array]:
+            state, distance_M = carry
+            first = jnp.argmax(distance_M > limit)
+            product_M = jnp.dot(values_MP, values_MP[first], precision=jax.lax.Precision.HIGHEST)
+            to_new_M = jnp.maximum((norm_M - product_M) + (norm_M[first] - product_M), 0)
+            codes_KP = state.codes_KP.at[state.count].set(patches_MP[first])
+            # A code is at distance 0 from itself, whatever rounding says: this also makes the loop end.
+            nearest_M = jnp.minimum(distance_M, to_new_M).at[first].set(0)
+            return NearestNeighborState(codes_KP, state.count + 1), nearest_M
+
+        grown, distance_M = jax.lax.while_loop(growing, grow, (state, distance_M))
+        squared_M = distance_M / self.observation.high**2
+        metrics = {
+            "codes": grown.count,
+            "new_codes": grown.count - state.count,
+            "mean_distance": squared_M.mean(),
+            "max_distance": squared_M.max(),
+        }
+        return grown, metrics
+
+    def encode(self, state: NearestNeighborState, observation: jax.Array) -> jax.Array:
+        """int32 [..., L]: the nearest stored code of each patch, ties to the older; 0 while the codebook is empty."""
+        patches = split_patches(observation, self.patch)
+        _, code_M = self._nearest(state, patches.reshape(-1, patches.shape[-1]))
+        return code_M.reshape(patches.shape[:-1])
+
+    def decode(self, state: NearestNeighborState, tokens: jax.Array) -> jax.Array:
+        """uint8 [..., H, W, C]: the stored patches themselves."""
+        return join_patches(state.codes_KP[tokens], self.observation.shape, self.patch)
+
+    def valid_codes(self, state: NearestNeighborState) -> jax.Array:
+        """bool [K]: the codes that are filled."""
+        return jnp.arange(self.codebook_size) < state.count
+
+    def _nearest(self, state: NearestNeighborState, patches_MP: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Squared distance (in units of 1/high**2) and index of each patch's nearest code; infinity where none is."""
+        codes_KP = state.codes_KP.astype(jnp.float32)
+        norm_K = jnp.where(self.valid_codes(state), _squared_norm(codes_KP), jnp.inf)
+
+        def nearest(chunk_CP: jax.Array) -> tuple[jax.Array, jax.Array]:
+            values_CP = chunk_CP.astype(jnp.float32)
+            product_CK = jnp.dot(values_CP, codes_KP.T, precision=jax.lax.Precision.HIGHEST)
+            distance_CK = (norm_K[None] - product_CK) + (_squared_norm(values_CP)[:, None] - product_CK)
+            return jnp.maximum(distance_CK.min(-1), 0), jnp.argmin(distance_CK, -1).astype(jnp.int32)
+
+        total = patches_MP.shape[0]
+        chunks = math.ceil(total * self.codebook_size / CHUNK_DISTANCES)
+        size = math.ceil(total / chunks)
+        padded_MP = jnp.pad(patches_MP, ((0, chunks * size - total), (0, 0)))
+        distance, code = jax.lax.map(nearest, padded_MP.reshape(chunks, size, -1))
+        return distance.reshape(-1)[:total], code.reshape(-1)[:total]
+
+
+def _squared_norm(values: jax.Array) -> jax.Array:
+    return jnp.square(values).sum(-1)

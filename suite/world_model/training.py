@@ -1,0 +1,148 @@
+"""One gradient step of the world model: block teacher forcing and its losses (Section 3.6, Appendix A.2.2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import nnx, struct
+
+from suite.config import WorldModelConfig
+from suite.interface.tokens import TokenSpec
+from suite.world_model.transformer import WorldModel
+
+CHUNK_LOGITS = 2**25  # observation logits held at once: 128 MiB
+
+
+@struct.dataclass
+class Sequences:
+    """B replayed sequences of T steps and T + 1 frames, their observations as tokens.
+
+    Attributes:
+      tokens_BTL: int32 [B, T + 1, L].
+      action_BT: int32; taken at frame t.
+      reward_BT: float32; what it earned.
+      terminated_BT: bool; the episode ended there, and frame t + 1 belongs to the next one.
+      ended_BT: bool; terminated or truncated; None: terminated. Only `mask_after_done` looks at it.
+    """
+
+    tokens_BTL: jax.Array
+    action_BT: jax.Array
+    reward_BT: jax.Array
+    terminated_BT: jax.Array
+    ended_BT: jax.Array | None = None
+
+
+@struct.dataclass
+class WorldModelLearner:
+    """What training changes: the parameters (an `nnx.State`) and the optimizer's state."""
+
+    params: Any
+    optimizer: optax.OptState
+
+
+def make_optimizer(config: WorldModelConfig) -> optax.GradientTransformation:
+    """Adam after clipping the gradient's global norm (fidelity note 23)."""
+    return optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate, eps=config.adam_eps)
+    )
+
+
+def losses(
+    model: WorldModel,
+    sequences: Sequences,
+    config: WorldModelConfig,
+    spec: TokenSpec,
+    dropout_key: jax.Array | None = None,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """The sum of three cross-entropies in nats, means over tokens or steps, and scalar metrics.
+
+    Observation + `reward_weight` * (reward + termination). Sequences may cross episodes; with `mask_after_done` only
+    what comes before an episode's end counts: all three losses up to it, but not the tokens it leads to.
+    """
+    frame, following = sequences.tokens_BTL[:, :-1], sequences.tokens_BTL[:, 1:]
+    hidden_BTSD = model(frame, sequences.action_BT, dropout_key)
+    step_weight_BT, token_weight_BT = _weights(sequences, config.mask_after_done)
+    token_loss_BTL, correct_BTL = _token_losses(model, hidden_BTSD, following)
+    token_weight_BTL = jnp.broadcast_to(token_weight_BT[..., None], following.shape)
+
+    reward_class_BT = spec.reward_to_class(sequences.reward_BT)
+    reward_loss_BT, reward_correct_BT = cross_entropy(model.reward_logits(hidden_BTSD), reward_class_BT)
+    termination_loss_BT, _ = cross_entropy(
+        model.termination_logits(hidden_BTSD), sequences.terminated_BT.astype(jnp.int32)
+    )
+    metrics = {
+        "observation_loss": _mean(token_loss_BTL, token_weight_BTL),
+        "token_accuracy": _mean(correct_BTL, token_weight_BTL),
+        "changed_token_accuracy": _mean(correct_BTL, token_weight_BTL * (frame != following).astype(jnp.float32)),
+        "reward_loss": _mean(reward_loss_BT, step_weight_BT),
+        "reward_accuracy": _mean(reward_correct_BT, step_weight_BT),
+        "termination_loss": _mean(termination_loss_BT, step_weight_BT),
+    }
+    other = metrics["reward_loss"] + metrics["termination_loss"]
+    return metrics["observation_loss"] + config.reward_weight * other, metrics
+
+
+def update(
+    config: WorldModelConfig,
+    optimizer: optax.GradientTransformation,
+    graphdef: nnx.GraphDef,
+    spec: TokenSpec,
+    learner: WorldModelLearner,
+    sequences: Sequences,
+    key: jax.Array,
+) -> tuple[WorldModelLearner, dict[str, jax.Array]]:
+    """One gradient step; the metrics are `losses`', `loss` and `grad_norm` (before clipping)."""
+
+    def loss(params: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+        return losses(nnx.merge(graphdef, params), sequences, config, spec, key)
+
+    (value, metrics), grads = jax.value_and_grad(loss, has_aux=True)(learner.params)
+    with jax.numpy_dtype_promotion("standard"):  # Optax's Adam mixes int32 and float
+        updates, state = optimizer.update(grads, learner.optimizer, learner.params)
+    metrics |= {"loss": value, "grad_norm": optax.global_norm(grads)}
+    return WorldModelLearner(optax.apply_updates(learner.params, updates), state), metrics
+
+
+def cross_entropy(logits: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Nats of `target` [...] under `logits` [..., C], and whether no class is likelier than it (float32 0 or 1)."""
+    # A masked sum instead of a gather: its gradient needs no scatter.
+    index = jax.lax.broadcasted_iota(target.dtype, logits.shape, logits.ndim - 1)
+    chosen = jnp.where(index == target[..., None], logits, 0).sum(-1)
+    return jax.nn.logsumexp(logits, axis=-1) - chosen, (chosen >= logits.max(-1)).astype(jnp.float32)
+
+
+def _token_losses(model: WorldModel, hidden_BTSD: jax.Array, target_BTL: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Observation cross-entropy [B, T, L] and correctness, a few sequences at a time.
+
+    The logits of a chunk are dropped and computed again for the backward pass, so that B * T * L * K of them never exist.
+    """
+
+    @jax.checkpoint
+    def chunk_losses(hidden: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return cross_entropy(model.observation_logits(hidden), target)
+
+    batch = target_BTL.shape[0]
+    logits = target_BTL[0].size * model.observation_head.bias.shape[0]
+    chunk = max(size for size in range(1, batch + 1) if batch % size == 0 and size * logits <= max(CHUNK_LOGITS, logits))
+    split = (hidden_BTSD, target_BTL)
+    chunked = jax.tree.map(lambda x: x.reshape(batch // chunk, chunk, *x.shape[1:]), split)
+    loss, correct = jax.lax.map(lambda pair: chunk_losses(*pair), chunked)
+    return loss.reshape(target_BTL.shape), correct.reshape(target_BTL.shape)
+
+
+def _weights(sequences: Sequences, mask_after_done: bool) -> tuple[jax.Array, jax.Array]:
+    """0 or 1 for each step's reward and termination, and for the frame it leads to (fidelity note 21)."""
+    ended_BT = sequences.terminated_BT if sequences.ended_BT is None else sequences.ended_BT
+    if not mask_after_done:
+        ended_BT = jnp.zeros_like(ended_BT)
+    ends_BT = jnp.cumsum(ended_BT.astype(jnp.int32), axis=1)
+    before_BT = ends_BT - ended_BT.astype(jnp.int32)
+    return (before_BT == 0).astype(jnp.float32), (ends_BT == 0).astype(jnp.float32)
+
+
+def _mean(value: jax.Array, weight: jax.Array) -> jax.Array:
+    """Weighted mean; 0 where nothing counts."""
+    return (value * weight).sum() / jnp.maximum(weight.sum(), 1)

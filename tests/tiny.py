@@ -1,0 +1,101 @@
+"""Tiny environments with known answers, for tests of everything above the adapters."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
+from suite.interface.turns import Turn
+
+CORRIDOR_SPEC = EnvironmentSpec(
+    id="corridor",
+    observation=ObservationSpec(shape=(4, 4, 1), high=255, kind="pixels", patch=(2, 2)),
+    num_actions=2,
+    reward_classes=(0.0, 1.0),
+    max_return=1.0,
+    achievements=("arrive",),
+    statistics=(("achievements", (1,)), ("achievement_return", ()), ("health_return", ())),
+    package="numpy",
+)
+
+
+@struct.dataclass
+class CorridorState:
+    position: jax.Array
+    time: jax.Array
+
+
+class Corridor:
+    """Four cells, one of the corners of the picture each; action 1 goes on, 0 back; the fourth cell pays 1 and ends.
+
+    Starts in cell 0 or 1. Truncated after `limit` steps.
+    """
+
+    spec = CORRIDOR_SPEC
+
+    def __init__(self, limit: int = 6):
+        self.limit = limit
+
+    def reset(self, key: jax.Array) -> tuple[CorridorState, TimeStep]:
+        state = CorridorState(jax.random.randint(key, (), 0, 2), jnp.int32(0))
+        no = jnp.zeros((), bool)
+        return state, self._show(state, jnp.float32(0), no, no, ~no)
+
+    def step(self, key: jax.Array, state: CorridorState, action: jax.Array) -> tuple[CorridorState, TimeStep]:
+        state = CorridorState(jnp.clip(state.position + 2 * action - 1, 0, 3), state.time + 1)
+        terminated = state.position == 3
+        truncated = ~terminated & (state.time >= self.limit)
+        return state, self._show(state, terminated.astype(jnp.float32), terminated, truncated, jnp.zeros((), bool))
+
+    def _show(self, state, reward, terminated, truncated, first) -> TimeStep:
+        corner = jnp.arange(4) == state.position
+        frame = jnp.where(corner, 255, 0).astype(jnp.uint8).reshape(2, 2)
+        observation = jnp.repeat(jnp.repeat(frame, 2, 0), 2, 1)[..., None]
+        statistics = {"achievements": (reward > 0)[None], "achievement_return": reward, "health_return": 0 * reward}
+        return TimeStep(observation, reward, terminated, truncated, first, observation, statistics)
+
+
+PENNIES_SPEC = EnvironmentSpec(
+    id="pennies",
+    observation=ObservationSpec(shape=(2,), high=3, kind="symbols"),
+    num_actions=2,
+    reward_classes=(-1.0, 0.0, 1.0),
+    two_player=True,
+)
+
+
+class Pennies:
+    """Chance deals a coin (outcome 0 or 2 of three), player 1 guesses, player 2 passes (one legal action), pays +-1.
+
+    Player 2's pass carries the reward, so that it must reach player 1's guess two events before. Our seat is 1.
+    """
+
+    spec = PENNIES_SPEC
+
+    def reset(self, key: jax.Array) -> tuple[jax.Array, TimeStep]:
+        state = jnp.zeros(3, jnp.int32)  # who is to act: 0 chance, 1 us, 2 them; the coin; our guess
+        return state, self._show(state, jnp.float32(0), jnp.zeros((), bool), jnp.ones((), bool))
+
+    def step(self, key: jax.Array, state: jax.Array, action: jax.Array) -> tuple[jax.Array, TimeStep]:
+        player, coin, guess = state
+        coin = jnp.where(player == 0, action // 2, coin)
+        guess = jnp.where(player == 1, action, guess)
+        done = player == 2
+        reward = jnp.where(done, jnp.where(coin == guess, 1.0, -1.0), 0.0)
+        state = jnp.stack([(player + 1) % 3, coin, guess])
+        return state, self._show(state, reward, done, jnp.zeros((), bool))
+
+    def _show(self, state, reward, terminated, first) -> TimeStep:
+        player, coin, _ = state
+        observation = jnp.stack([player, jnp.where(player == 1, 1 + coin, 0)]).astype(jnp.uint8)
+        turn = Turn(
+            player=player,
+            seat=jnp.int32(1),
+            legal_A=jnp.where(player == 0, False, jnp.array([True, True]) & ((player == 1) | jnp.array([True, False]))),
+            chance_C=jnp.where(player == 0, jnp.array([0.5, 0.0, 0.5]), 0.0),
+            opponent_observation=observation,
+        )
+        no = jnp.zeros((), bool)
+        return TimeStep(observation, reward, terminated, no, first, observation, {}, turn)
