@@ -25,6 +25,8 @@ def craftax(
     """
     assert spec.max_return is not None
     episodes = pd.DataFrame(episodes)
+    if episodes.empty:  # then not even the columns need be there
+        episodes = pd.DataFrame(columns=["step", "return", "achievement_return", *spec.achievements], dtype=float)
     steps, final_fraction = (
         (config.protocol.steps, config.protocol.final_fraction) if config else (episodes["step"].max(), 1.0)
     )

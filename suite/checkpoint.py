@@ -111,7 +111,7 @@ def latest_step(folder: Path) -> int | None:
 def drop_resume(folder: Path) -> None:
     """Deletes what only going on needs, and all but the newest checkpoint: for a finished run."""
     newest = latest_step(folder)
-    for step in _steps(folder):
+    for step in _steps(folder) if newest is not None else ():
         path = folder / _name(step)
         if step != newest:
             shutil.rmtree(path)

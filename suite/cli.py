@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import numbers
 import os
 import re
 import statistics
@@ -18,6 +19,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from suite.compilation import quiet_xla
 from suite.errors import RunError, UserError, did_you_mean
 
 if TYPE_CHECKING:
@@ -31,6 +33,7 @@ BAD_INPUT, FAILED, STOPPED = 2, 1, 130
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code."""
+    quiet_xla()
     try:
         return _dispatch(sys.argv[1:] if argv is None else list(argv))
     except (UserError, RunError) as error:
@@ -116,38 +119,45 @@ def _seeds(text: str) -> list[int]:
     """Seeds of "0-2" or "0,3,5", or of both mixed."""
     seeds: list[int] = []
     for part in text.split(","):
-        first, _, last = part.partition("-")
-        if not first.isdigit() or not (last or first).isdigit() or int(last or first) < int(first):
+        match = re.fullmatch(r"([0-9]+)(?:-([0-9]+))?", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
+        if last < first:
             raise argparse.ArgumentTypeError(f"{text!r} is not of the form 0-2 or 0,3,5")
-        seeds += range(int(first), int(last or first) + 1)
+        seeds += range(first, last + 1)
     return list(dict.fromkeys(seeds))
 
 
 def _run(args: argparse.Namespace) -> int:
     from suite import registry
-    from suite.record import require_writable, run_folder
+    from suite.record import RunRecord, require_writable, run_folder
 
     seeds = args.seeds or [args.seed]
     configs = [registry.resolve(args.task, args.agent, args.preset, args.overrides, seed, args.steps) for seed in seeds]
+    folders = [run_folder(args.out, config) for config in configs]
+    begun = [(folder / "record.json").exists() for folder in folders]
+    if args.resume and not any(begun):
+        raise UserError(f"nothing to resume in {folders[0]}: run without --resume to start there")
     require_writable(args.out)
+    for folder, config, exists in zip(folders, configs, begun, strict=True):
+        if exists:  # so that the last seed's folder is known to be right before the first one's run starts
+            RunRecord.open(folder, config, lock=False)
 
     from suite import run
 
     results: list[Result] = []
-    for config in configs:
+    for folder, config, exists in zip(folders, configs, begun, strict=True):
         if not args.quiet:
-            folder = run_folder(args.out, config)
             what = f"{config.task}, agent {config.agent}, preset {config.preset}, seed {config.seed}"
             print(f"{what}, on {_device()}; files in {folder}", flush=True)
-        result = run.run(config, args.out, _reporter(args.quiet), args.resume)
+        result = run.run(config, args.out, _reporter(args.quiet), args.resume and exists)
         results.append(result)
         _print_result(result)
         if result.status == "stopped":
             break
-    stopped = results[-1].status == "stopped"
-    summary = _summary(results)
-    if len(results) > 1:
-        print(f"{len(results)} seeds, mean +- standard error:")
+    finished = [result for result in results if result.status != "stopped"]
+    summary = _summary(finished)
+    if len(finished) > 1:
+        print(f"{len(finished)} seeds, mean +- standard error:")
         for name, (mean, error) in summary.items():
             print(_score_line(name, mean, error))
     if args.json:
@@ -161,7 +171,7 @@ def _run(args: argparse.Namespace) -> int:
             fields["mean"] = {name: mean for name, (mean, _) in summary.items()}
             fields["standard_error"] = {name: error for name, (_, error) in summary.items()}
         _print_json(fields)
-    return STOPPED if stopped else 0
+    return STOPPED if len(finished) < len(results) else 0
 
 
 def _list(args: argparse.Namespace) -> int:
@@ -207,7 +217,7 @@ def _describe(args: argparse.Namespace) -> int:
         )
     counted = [f"{name.replace('_', ' ')} {description.parameters(name):,}" for name in ("policy", "world_model")]
     counted.append(f"2 x codebook {description.parameters('codebook'):,} (stored twice in the paper's bookkeeping)")
-    print(f"\nTotal: {description.total:,}", f"= {' + '.join(counted)}" if "codebook" in description.modules else "")
+    print(f"\nTotal: {description.total:,}{' = ' + ' + '.join(counted) if 'codebook' in description.modules else ''}")
     print("\nDerived")
     _print_table([name, f"{value:,}", how] for name, value, how in description.derived)
     return 0
@@ -223,9 +233,7 @@ def _evaluate(args: argparse.Namespace) -> int:
     from suite import evaluation
 
     scores = evaluation.evaluate(args.folder, args.episodes, _reporter(args.quiet))
-    for name, value in scores.items():
-        if "/" not in name:
-            print(_score_line(name, value))
+    _print_scores(scores)
     print(f"record {args.folder}")
     if args.json:
         _print_json({"folder": str(args.folder), **scores})
@@ -272,9 +280,7 @@ def _print_result(result: Result) -> None:
         print(f"stopped at step {result.steps:,}; the same command goes on from there")
     elif result.status == "already finished":
         print("already finished: nothing was run")
-    for name, value in result.scores.items():
-        if "/" not in name:
-            print(_score_line(name, value))
+    _print_scores(result.scores)
     print(f"record {result.folder}", flush=True)
 
 
@@ -290,19 +296,29 @@ def _result_fields(seed: int, result: Result) -> dict[str, Any]:
 
 
 def _summary(results: Sequence[Result]) -> dict[str, tuple[float, float]]:
-    """Mean and standard error of each score over finished runs; nan where they say nothing."""
-    scores = [result.scores for result in results if result.status != "stopped"]
+    """Mean and standard error of each score; nan where they say nothing."""
     summary = {}
-    for name in scores[0] if scores else ():
-        values = [float(run[name]) for run in scores]
-        error = statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+    for name in (name for name in (results[0].scores if results else ()) if "/" not in name):
+        values = [float(result.scores[name]) for result in results]
+        known = len(values) > 1 and all(map(math.isfinite, values))
+        error = statistics.stdev(values) / math.sqrt(len(values)) if known else math.nan
         summary[name] = (statistics.fmean(values), error)
-    return {name: pair for name, pair in summary.items() if "/" not in name}
+    return summary
+
+
+def _print_scores(scores: Mapping[str, Any]) -> None:
+    """One line each, but for the parts of a score ("success_percent/..."); nan is a mean over no episodes."""
+    reason = "no episode ended in the part that counts" if scores.get("episodes") else "no episode ended yet"
+    for name, value in scores.items():
+        if "/" not in name:
+            print(_score_line(name, value) + (f", {reason}" if value != value else ""))
 
 
 def _score_line(name: str, value: float, error: float | None = None) -> str:
     """`("reward_percent", 12.34, 0.56)` as "reward 12.34 % +- 0.56 %"."""
-    label, unit = name.removesuffix("_percent").replace("_", " "), " %" if name.endswith("_percent") else ""
+    label, unit = name.replace("_percent", "").replace("_", " "), " %" if "_percent" in name else ""
+    if math.isnan(value):
+        return f"{label} n/a"
     spread = "" if error is None else f" +- {_value(error)}{unit}"
     return f"{label} {_value(value)}{unit}{spread}"
 
@@ -311,8 +327,10 @@ def _value(value: Any) -> str:
     """A cell: whole numbers whole, measured ones with two decimals or three digits."""
     if isinstance(value, bool) or not isinstance(value, float):
         return str(value)
-    if not math.isfinite(value) or value == int(value):
-        return f"{value:g}"
+    if not math.isfinite(value):
+        return "n/a" if math.isnan(value) else f"{value:g}"
+    if value == int(value):
+        return f"{value:.0f}"
     return f"{value:.2f}" if abs(value) >= 1 else f"{value:.3g}"
 
 
@@ -333,7 +351,7 @@ def _finite(value: Any) -> Any:
         return {name: _finite(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):
         return [_finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return None if isinstance(value, numbers.Real) and not math.isfinite(value) else value
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ Networks are traced in shape only: nothing is compiled or allocated.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -96,7 +97,7 @@ def describe(layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec) -> 
 def _settings(layers: Sequence[tuple[Source, Config]]) -> list[Setting]:
     fields = [(source, dotted(config)) for source, config in layers]
     origin = dict.fromkeys(fields[0][1], fields[0][0])
-    for (_, before), (source, after) in zip(fields, fields[1:], strict=False):
+    for (_, before), (source, after) in itertools.pairwise(fields):
         origin |= {name: source for name in after if after[name] != before[name]}
     return [Setting(name, value, origin[name]) for name, value in fields[-1][1].items()]
 

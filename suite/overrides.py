@@ -92,7 +92,7 @@ def _replace(part: Any, fields: Mapping[str, Any], prefix: str) -> Any:
     try:
         replaced = dataclasses.replace(part, **fields)
     except ValidationError as error:
-        raise UserError(_one_line(error, prefix)) from error
+        raise UserError(first_problem(error, prefix)) from error
     for name, value in fields.items():
         # pydantic reads 1 as true and true as 1; in a hyperparameter that is a slip of the pen.
         if isinstance(value, bool) != isinstance(getattr(replaced, name), bool):
@@ -101,8 +101,8 @@ def _replace(part: Any, fields: Mapping[str, Any], prefix: str) -> Any:
     return replaced
 
 
-def _one_line(error: ValidationError, prefix: str) -> str:
-    """The first of pydantic's complaints: the field, the value, what would be right."""
+def first_problem(error: ValidationError, prefix: str = "") -> str:
+    """The first of pydantic's complaints, in one line: the field, the value, what would be right."""
     first = error.errors()[0]
     place = prefix + ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")

@@ -21,20 +21,20 @@ import contextlib
 import datetime
 import errno
 import fcntl
-import importlib.metadata
 import json
 import os
 import platform
-import resource
-import subprocess
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from pydantic import ValidationError
+
 from suite import registry
 from suite.config import Config, hash_of
 from suite.errors import RunError, UserError
-from suite.overrides import dotted
+from suite.overrides import dotted, first_problem
+from suite.surroundings import package_version, peak_memory, surroundings
 from suite.tables import Table, write_whole
 
 if TYPE_CHECKING:
@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     from suite.interface.environment import EnvironmentSpec
 
 SCHEMA = 1
-PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "flashbax", "numpy", "world-model-suite")
+# Fields without which a record can be neither read nor gone on with.
+NEEDED = frozenset({"protocol", "columns", "status", "steps", "wall_clock_seconds", "peak_memory_bytes", "resumed"})
 
 
 def run_folder(out: Path, config: Config) -> Path:
@@ -97,7 +98,7 @@ def protocol(config: Config, spec: EnvironmentSpec) -> dict[str, Any]:
         "steps": config.protocol.steps,
         "final_fraction": config.protocol.final_fraction,
         "package": spec.package,
-        "package_version": _version(spec.package) if spec.package else "",
+        "package_version": package_version(spec.package) if spec.package else "",
     }
 
 
@@ -121,6 +122,7 @@ class RunRecord:
         }
         self._events: Any = None
         self._purge_step: int | None = None
+        self._new = False
 
     @classmethod
     def create(cls, folder: Path, config: Config, spec: EnvironmentSpec) -> RunRecord:
@@ -160,12 +162,14 @@ class RunRecord:
             "ended": None,
             "wall_clock_seconds": {"total": 0.0},
             "peak_memory_bytes": {},
-            **_surroundings(),
+            **surroundings(),
             "resumed": [],
         }
         _write_json(folder / "config.json", config.as_dict())
         _write_json(folder / "record.json", fields)  # last: a folder is a run from here on
-        return cls(folder, config, fields, spec, lock)
+        record = cls(folder, config, fields, spec, lock)
+        record._new = True
+        return record
 
     @classmethod
     def open(
@@ -182,21 +186,20 @@ class RunRecord:
         Raises:
           UserError: no run folder, another schema, damaged, another run than expected, or in use.
         """
-        fields = _read_json(folder, "record.json")
-        if fields.get("schema") != SCHEMA:
-            raise UserError(f"{folder} has a record of schema {fields.get('schema')}; this version reads {SCHEMA}")
+        _read_fields(folder)  # nothing, not even a lock, is written into a folder that holds no run
+        held = _acquire(folder) if lock else None
         try:
-            stored = Config(**_read_json(folder, "config.json"))
-        except (TypeError, ValueError) as error:
-            raise UserError(f"{folder}/config.json is not of this version: {str(error).splitlines()[0]}") from error
-        if config is not None:
-            _require_same_run(folder, stored, config)
-        if config is not None and spec is not None and fields["protocol"] != protocol(config, spec):
-            raise UserError(
-                f"{folder} was started with {spec.package} {fields['protocol']['package_version']}, not with the "
-                f"installed {_version(spec.package)}; choose another --out"
-            )
-        return cls(folder, config or stored, fields, spec, _acquire(folder) if lock else None)
+            fields = _read_fields(folder)
+            stored = _read_config(folder)
+            if config is not None:
+                _require_same_run(folder, stored, config)
+            if config is not None and spec is not None:
+                _require_same_rules(folder, fields["protocol"], protocol(config, spec))
+            return cls(folder, config or stored, fields, spec, held)
+        except BaseException:
+            if held is not None:
+                held.close()
+            raise
 
     @classmethod
     def open_or_create(cls, folder: Path, config: Config, spec: EnvironmentSpec) -> RunRecord:
@@ -268,8 +271,10 @@ class RunRecord:
         for name, columns in self.fields["columns"].items():
             moved += self._tables[name].rewind(step, aside / f"{name}.csv")
             self._tables[name] = Table(self.folder / f"{name}.csv", columns)
-        self._purge_step = step + 1
-        self.update(steps=step, resumed=[*self.fields["resumed"], {"step": step, "date": _now(), **_surroundings()}])
+        if not self._new:  # a run that has only just begun is not resumed
+            self._purge_step = step + 1
+            resumed = {"step": step, "date": _now(), **surroundings()}
+            self.update(steps=step, resumed=[*self.fields["resumed"], resumed])
         return moved
 
     def update(self, **fields: Any) -> None:
@@ -281,7 +286,7 @@ class RunRecord:
 
     def add_wall_clock(self, seconds: float, phases: Mapping[str, float]) -> None:
         """Notes the time that this process took, and each phase's over all processes; and the peak memory so far."""
-        peaks = _peak_memory()
+        peaks = peak_memory()
         before = self.fields["peak_memory_bytes"]
         self.update(
             wall_clock_seconds={**phases, "total": self.wall_seconds + seconds},
@@ -343,50 +348,29 @@ def _require_same_run(folder: Path, stored: Config, asked: Config) -> None:
             raise UserError(f"{folder} holds a run with {name}={old[name]}, not {new[name]}; choose another --out")
 
 
-def _surroundings() -> dict[str, Any]:
-    """What else the result may depend on."""
-    import jax
-
-    device = jax.devices()[0]
-    return {
-        "python": platform.python_version(),
-        "packages": {name: _version(name) for name in PACKAGES},
-        "git_commit": _git_commit(),
-        "device": {"platform": device.platform, "kind": device.device_kind, "cpu_cores": os.cpu_count()},
-    }
+def _require_same_rules(folder: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
+    for name, value in new.items():
+        if old.get(name) != value:
+            raise UserError(
+                f"{folder} was started under {name}={old.get(name)}, not the present {value}; choose another --out"
+            )
 
 
-def _peak_memory() -> dict[str, int]:
-    """Bytes: of this process, and of the device where it has memory of its own."""
-    import jax
-
-    peaks = {"process": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024}  # Linux counts in KiB
-    statistics = jax.devices()[0].memory_stats() or {}
-    if "peak_bytes_in_use" in statistics:
-        peaks["device"] = statistics["peak_bytes_in_use"]
-    return peaks
+def _read_fields(folder: Path) -> dict[str, Any]:
+    fields = _read_json(folder, "record.json")
+    if fields.get("schema") != SCHEMA:
+        raise UserError(f"{folder} has a record of schema {fields.get('schema')}; this version reads {SCHEMA}")
+    if missing := NEEDED - fields.keys():
+        raise UserError(f"{folder}/record.json is damaged: it lacks {', '.join(sorted(missing))}")
+    return fields
 
 
-def _version(package: str) -> str | None:
+def _read_config(folder: Path) -> Config:
+    fields = _read_json(folder, "config.json")
     try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
-def _git_commit() -> str | None:
-    """The commit of the code that runs, "-dirty" if it was changed since; None if it is no checkout."""
-    here = Path(__file__)
-
-    def git(*arguments: str) -> str:
-        command = ["git", "-C", str(here.parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", here.name)  # or an installed copy inside someone else's checkout
-        return git("describe", "--always", "--abbrev=40", "--exclude=*", "--dirty")
-    except (OSError, subprocess.SubprocessError):
-        return None
+        return Config(**fields)
+    except ValidationError as error:
+        raise UserError(f"{folder}/config.json is not of this version: {first_problem(error)}") from error
 
 
 def _now() -> str:

@@ -68,7 +68,7 @@ class RichReporter(QuietReporter):
         self._interval = interval
         self._next_line = 0.0
         self._bar: Progress | None = None
-        self._total = self._steps = 0
+        self._total = self._steps = 0  # a total of 0: not known
         self._phase = ""
         self._fields: dict[str, float] = {}
         self._history: deque[tuple[float, int]] = deque(maxlen=WINDOW)
@@ -84,7 +84,7 @@ class RichReporter(QuietReporter):
         self._show(done_steps, total_steps, self._line())
 
     def update(self, steps: int, phase: str, fields: dict[str, float]) -> None:
-        if steps > self._steps:
+        if steps > self._steps or not self._history:
             self._history.append((time.monotonic(), steps))
         self._steps = steps
         self._phase = phase or self._phase
@@ -103,12 +103,15 @@ class RichReporter(QuietReporter):
         self._next_line = 0.0
 
     def _line(self) -> str:
-        parts = [f"{self._steps:,}/{self._total:,} steps", self._phase]
+        total = f"/{self._total:,}" if self._total else ""
+        parts = [f"{self._steps:,}{total} steps", self._phase]
         parts += [f"{name} {value:.3g}" for name, value in self._fields.items()]
         (start_time, start_steps), (end_time, end_steps) = self._history[0], self._history[-1]
-        if end_steps > start_steps:
+        if end_steps > start_steps and end_time > start_time:
             speed = (end_steps - start_steps) / (end_time - start_time)
-            parts += [f"{speed:,.0f} steps/s", f"{_duration((self._total - self._steps) / speed)} left"]
+            parts.append(f"{speed:,.0f} steps/s")
+            if self._total > self._steps:
+                parts.append(f"{_duration((self._total - self._steps) / speed)} left")
         return " | ".join(part for part in parts if part)
 
     def _show(self, done: float, total: float, text: str) -> None:
@@ -117,10 +120,11 @@ class RichReporter(QuietReporter):
                 self._bar = Progress(BarColumn(bar_width=24), TextColumn("{task.description}"), console=self._console)
                 self._bar.add_task("")
                 self._bar.start()
-            self._bar.update(self._bar.task_ids[0], completed=done, total=total, description=escape(text))
+            self._bar.update(self._bar.task_ids[0], completed=done, total=total or None, description=escape(text))
         elif (now := time.monotonic()) >= self._next_line:
             self._next_line = now + self._interval
-            self._console.print(f"{done / total:4.0%} {escape(text)}")
+            share = f"{done / total:4.0%} " if total else ""
+            self._console.print(f"{share}{escape(text)}")
 
 
 def _duration(seconds: float) -> str:

@@ -32,7 +32,7 @@ class Table:
             self.append([])
 
     def append(self, rows: Iterable[Mapping[str, Any]], names: Iterable[str] = ()) -> None:
-        """Adds rows at the end, on disk when this returns. A column that a row leaves out stays empty.
+        """Adds rows at the end: all of them, on disk when this returns, or none. What a row leaves out stays empty.
 
         Args:
           rows: values by column.
@@ -40,6 +40,7 @@ class Table:
 
         Raises:
           ValueError: a row has a column that the table has not.
+          OSError: the file cannot be written; it is as before.
         """
         rows = list(rows)
         if not self.columns:
@@ -49,12 +50,19 @@ class Table:
         for row in rows:
             if unknown := row.keys() - set(self.columns):
                 raise ValueError(f"{self.path.name} has no column {', '.join(sorted(unknown))}")
-        with self.path.open("ab") as file:
-            if file.tell() == 0:
-                file.write(_lines([self.columns]))
-            file.write(_lines([cell(row.get(name)) for name in self.columns] for row in rows))
-            file.flush()
-            os.fsync(file.fileno())
+        with self.path.open("a+b", buffering=0) as file:
+            size = _whole_rows(file)
+            header = [] if size else [self.columns]
+            lines = _lines([*header, *([cell(row.get(name)) for name in self.columns] for row in rows)])
+            try:
+                if lines:
+                    file.truncate(size)
+                while lines:  # a nearly full disk takes a part
+                    lines = lines[file.write(lines) :]
+                os.fsync(file.fileno())
+            except OSError:
+                file.truncate(size)
+                raise
 
     def rewind(self, step: int, aside: Path) -> int:
         """Moves rows beyond `step`, and a last row that was cut off, to the file `aside`; returns how many."""
@@ -100,6 +108,16 @@ def _lines(rows: Iterable[Sequence[str]]) -> bytes:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue().encode()
+
+
+def _whole_rows(file: io.FileIO) -> int:
+    """The bytes up to the end of the last row that was written whole: a kill may have cut off the one after it."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(size - 1, 0))
+    if file.read(1) in (b"", b"\n"):
+        return size
+    file.seek(0)
+    return file.readall().rfind(b"\n") + 1
 
 
 def _header(path: Path) -> tuple[str, ...]:

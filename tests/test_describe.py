@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import pytest
+
+from suite import registry
+from suite.describe import describe
+
+
+def described(agent, preset="paper", overrides=()):
+    layers = registry.layers("craftax_classic", agent, preset, overrides)
+    return describe(layers, registry.task("craftax_classic").spec())
+
+
+@pytest.fixture(scope="module")
+def m5():
+    return described("m5")
+
+
+def shapes(description, module):
+    return {
+        f"{layer.name}.{name}": shape for layer in description.modules[module] for name, shape in layer.shapes.items()
+    }
+
+
+def test_counts_are_the_papers(m5):
+    """Fidelity notes, table of parameter counts: 58.5M."""
+    assert m5.parameters("policy") == 55_599_768
+    assert m5.parameters("world_model") == 1_699_972
+    assert m5.parameters("codebook") == 4096 * 147
+    assert m5.total == 58_503_964
+    assert m5.as_dict()["parameters"]["total"] == 58_503_964
+
+
+def test_sizes_are_the_papers(m5):
+    """Table "MFRL hyperparameters", sizes: CNN output 8x8x128, actor-critic input 8448."""
+    policy = shapes(m5, "policy")
+    assert policy["memory.input.kernel"] == (8 * 8 * 128, 256)
+    assert policy["trunks.0.first.kernel"] == policy["trunks.1.first.kernel"] == (8448, 2048)
+    assert shapes(m5, "codebook") == {".codes_KP": (4096, 7 * 7 * 3)}
+
+
+def test_mfrl_has_the_policy_only():
+    description = described("mfrl")
+    assert description.total == description.parameters("policy") == 55_599_768
+    assert description.modules.keys() == {"policy"}
+    assert dict(row[:2] for row in description.derived) == {
+        "steps per iteration": 4608,
+        "iterations": 217,
+        "real steps": 999_936,
+    }
+
+
+def test_other_structures_are_counted():
+    """Fidelity notes: the paper's text read literally, and K = 512."""
+    literal = described("mfrl", overrides=["policy.cnn_channels=[64,64,128]", "policy.convs_per_block=1"])
+    assert literal.total == 54_536_152 + 256 * 257  # the notes' count has no projection of the GRU's output
+    assert described("m5", overrides=["tokenizer.codebook_size=512"]).parameters("world_model") == 778_884
+
+
+def test_random_has_no_parameters():
+    assert described("random").total == 0
+
+
+def test_derived(m5):
+    derived = {name: value for name, value, _ in m5.derived}
+    assert derived == {
+        "steps per iteration": 48 * 96,
+        "iterations": 217,
+        "real steps": 999_936,
+        "first imagination": 202_752,
+        "iterations with imagination": 174,
+        "imagined policy updates": 174 * 150,
+        "imagined steps": 174 * 150 * 48 * 20,
+        "world-model gradient steps": 217 * 500 * 3,
+    }
+
+
+def test_sources():
+    settings = described("m5_slow", "smoke", ["ppo.discount=0.97"]).settings
+    sources = {setting.name: setting.source for setting in settings}
+    assert sources["ppo.discount"] == "user"
+    assert sources["world_model.updates"] == "agent"
+    assert sources["environment.num_envs"] == "preset"
+    assert sources["ppo.clip"] == "default"

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import importlib.metadata
+
+import pytest
+
+from suite import registry
+from suite.errors import UserError
+from suite.registry import AgentEntry, Lazy
+
+PUBLISHED = {  # Table "best scores": reward, score
+    "mfrl": ("55.49 +- 1.33 %", "16.77 +- 1.11 %"),
+    "m5": ("67.42 +- 0.55 %", "27.91 +- 0.63 %"),
+    "m5_slow": ("69.66 +- 1.20 %", "31.77 +- 1.43 %"),
+}
+
+
+def test_published_numbers():
+    for id, (reward, score) in PUBLISHED.items():
+        assert registry.agent(id).published == f"reward {reward}, score {score}"
+
+
+def test_everything_registered_can_be_imported():
+    for task in registry.tasks().values():
+        for lazy in (task.make, task.scores, *task.presets.values()):
+            assert callable(lazy())
+        assert task.spec().id == task.id
+        assert task.presets.keys() == registry.presets().keys()
+    for agent in registry.agents().values():
+        assert callable(agent.configure())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("craftax_clasic", "m5", "paper"), "unknown task 'craftax_clasic'; did you mean 'craftax_classic'?"),
+        (("craftax_classic", "mrfl", "paper"), "unknown agent 'mrfl'; did you mean 'mfrl'?"),
+        (("craftax_classic", "zzz", "paper"), "unknown agent 'zzz'; valid: m5, m5_slow, mfrl, random"),
+        (("craftax_classic", "m5", "papr"), "unknown preset 'papr'; did you mean 'paper'?"),
+    ],
+)
+def test_unknown_ids(arguments, message):
+    with pytest.raises(UserError) as caught:
+        registry.resolve(*arguments)
+    assert str(caught.value) == message
+
+
+def test_the_preset_fits_the_machine(monkeypatch):
+    monkeypatch.setattr(registry, "_on_accelerator", lambda: True)
+    config = registry.resolve("craftax_classic")
+    assert (config.preset, config.policy.compute_type, config.world_model.compute_type) == (
+        "paper",
+        "bfloat16",
+        "bfloat16",
+    )
+    monkeypatch.setattr(registry, "_on_accelerator", lambda: False)
+    config = registry.resolve("craftax_classic")
+    assert (config.preset, config.policy.compute_type) == ("small", "float32")
+
+
+def test_the_user_has_the_last_word():
+    overrides = ["world_model.updates=7", "policy.compute_type=bfloat16"]
+    layers = registry.layers("craftax_classic", "m5_slow", "small", overrides, seed=3, steps=20_000)
+    assert [source for source, _ in layers] == ["default", "preset", "agent", "user"]
+    config = layers[-1][1]
+    assert (config.seed, config.protocol.steps, config.world_model.updates) == (3, 20_000, 7)
+    assert config.policy.compute_type == "bfloat16"
+
+
+class Point:
+    """An entry point of another distribution."""
+
+    name = "theirs"
+
+    def __init__(self, load):
+        self.load = load
+
+
+def install(monkeypatch, load):
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [Point(load)])
+
+
+def test_other_distributions_add_but_do_not_replace(monkeypatch):
+    install(monkeypatch, lambda: AgentEntry("theirs", Lazy("baselines.ladder:m5"), "an agent"))
+    assert "theirs" in registry.agents()
+    install(monkeypatch, lambda: AgentEntry("m5", Lazy("nowhere:m5"), "an impostor"))
+    assert registry.agents()["m5"].summary != "an impostor"
+
+
+def broken():
+    raise ImportError("no module named x")
+
+
+@pytest.mark.parametrize(("load", "message"), [(broken, "cannot be loaded"), (lambda: 3, "is no AgentEntry")])
+def test_a_broken_entry_point_is_named(monkeypatch, load, message):
+    install(monkeypatch, load)
+    with pytest.raises(UserError, match=f"'theirs'.*{message}"):
+        registry.agents()
+
+
+def test_a_task_without_the_default_preset(monkeypatch):
+    import dataclasses
+
+    entry = registry.TASKS[0]
+    entry = dataclasses.replace(entry, presets={"smoke": entry.presets["smoke"]})
+    monkeypatch.setattr(registry, "TASKS", (entry,))
+    assert registry.resolve("craftax_classic").preset == "smoke"
