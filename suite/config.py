@@ -55,6 +55,7 @@ class PolicyConfig:
     cnn_channels: tuple[Positive, ...] = (64, 128, 128)  # one Impala stack each; the literal text: (64, 64, 128)
     blocks_per_stack: Positive = 2
     convs_per_block: Positive = 2  # the literal text: 1
+    max_pixels: Positive = 63  # larger frames are resized to this height and width, nearest pixel (note 4)
     cnn_norm: Literal["instance", "batch", "layer"] = "instance"  # note 1
     activation: Literal["relu", "swish"] = "relu"  # inside the CNN
     rnn_size: NotNegative = 256  # 0: no memory

@@ -27,6 +27,7 @@ from suite.world_model.imagination import Dream
 from suite.world_model.transformer import WorldModel
 
 Metrics = dict[str, jax.Array]
+IMAGINATION_METRICS = (*ppo.METRICS, "reward_per_step", "termination_rate")
 
 
 @struct.dataclass
@@ -79,6 +80,18 @@ class Agent:
             self.tokenizer, self.tokens, self.grid = build_tokenizer(config, spec)
             self.world_model_optimizer = world_model_training.make_optimizer(config.world_model)
             self.world_model_graph = nnx.graphdef(nnx.eval_shape(lambda: self._new_world_model(nnx.Rngs(0))))
+
+    @property
+    def metric_names(self) -> list[str]:
+        """Names of all metrics that iterations may have: `<phase>/<metric>`."""
+        phases: dict[str, tuple[str, ...]] = {}
+        if self.config.ppo.learn_from_real:
+            phases["learn"] = ppo.METRICS
+        if self.config.world_model.enabled:
+            phases["tokenizer"] = self.tokenizer.metrics
+            phases["world_model"] = world_model_training.METRICS
+            phases["imagine"] = IMAGINATION_METRICS
+        return [f"{phase}/{metric}" for phase, metrics in phases.items() for metric in metrics]
 
     def _new_policy(self, rngs: nnx.Rngs) -> Any:
         return make_policy(self.config.policy, self.spec.observation, self.spec.num_actions, rngs)
@@ -213,10 +226,13 @@ class Agent:
             learner, total = carry
             trajectory = self.dream(learner, model, tokenizer, replay, jax.random.fold_in(key, i))
             learner, metrics = self.learn_from_dream(learner, trajectory)
-            metrics |= {"reward": trajectory.reward_TB.mean(), "termination": trajectory.terminated_TB.mean(dtype=jnp.float32)}
+            metrics |= {
+                "reward_per_step": trajectory.reward_TB.mean(),
+                "termination_rate": trajectory.terminated_TB.mean(dtype=jnp.float32),
+            }
             return learner, jax.tree.map(jnp.add, total, metrics)
 
-        zeros = dict.fromkeys(self.imagination_metrics, jnp.zeros(()))
+        zeros = dict.fromkeys(IMAGINATION_METRICS, jnp.zeros(()))
         learner, total = jax.lax.fori_loop(0, updates, update, (learner, zeros))
         return learner, jax.tree.map(lambda x: x / updates.astype(jnp.float32), total)
 

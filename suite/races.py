@@ -1,0 +1,164 @@
+"""Two ways of doing the same, timed side by side: what `suite bench` prints beside the phases."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from suite import registry
+from suite.agent.dyna import Agent
+from suite.compilation import enable_compilation_cache
+from suite.config import Config
+from suite.interface.batching import Batched
+from suite.interface.environment import BatchedEnvironment, Environment
+from suite.world_model.transformer import WorldModel
+
+Table = list[dict[str, Any]]
+RACE_ENVS, RACE_STEPS = 48, 96
+
+
+def seconds_of(function: Callable[[], Any], least: float = 1.0, repeats: int = 3) -> float:
+    """Median seconds of a call that is already compiled; at least `repeats` calls and `least` seconds of them."""
+    times: list[float] = []
+    while len(times) < repeats or (sum(times) < least and len(times) < 100):
+        start = time.perf_counter()
+        jax.block_until_ready(function())
+        times.append(time.perf_counter() - start)
+    return sorted(times)[len(times) // 2]
+
+
+def reset_race(config: Config, environment: Environment) -> Table:
+    """Random play with exact auto-reset, against no reset at all and the package's own auto-reset if it has one."""
+    contestants: dict[str, BatchedEnvironment] = {
+        "no reset": NoReset(environment, RACE_ENVS),
+        "exact auto-reset": Batched(environment, RACE_ENVS),
+    }
+    own = registry.task(config.task).own_auto_reset
+    if own is not None:
+        contestants["the package's own auto-reset"] = own()(RACE_ENVS)
+    played = {name: _player_of(contestant, environment.spec.num_actions) for name, contestant in contestants.items()}
+    times: dict[str, list[float]] = {name: [] for name in played}
+    for _ in range(7):  # in turn, so that a drifting machine slows all of them
+        for name, play in played.items():
+            start = time.perf_counter()
+            play()
+            times[name].append(time.perf_counter() - start)
+    speed = {name: RACE_ENVS * RACE_STEPS / sorted(values)[len(values) // 2] for name, values in times.items()}
+    return [{"environment": n, "steps/s": s, "of no reset": s / speed["no reset"]} for n, s in speed.items()]
+
+
+@dataclasses.dataclass(frozen=True)
+class NoReset:
+    """What a batch costs when episodes are never reset: the bound for any auto-reset."""
+
+    environment: Environment
+    num_envs: int
+
+    @property
+    def spec(self) -> Any:
+        return self.environment.spec
+
+    def reset(self, key: jax.Array) -> Any:
+        return jax.vmap(self.environment.reset)(jax.random.split(key, self.num_envs))
+
+    def step(self, key: jax.Array, state: Any, action_B: jax.Array) -> Any:
+        return jax.vmap(self.environment.step)(jax.random.split(key, self.num_envs), state, action_B)
+
+
+def _player_of(environment: BatchedEnvironment, num_actions: int) -> Callable[[], None]:
+    """A compiled and warmed-up call that plays `RACE_STEPS` random steps and goes on from there the next time."""
+
+    def step(state, key):
+        action_key, step_key = jax.random.split(key)
+        action_B = jax.random.randint(action_key, (environment.num_envs,), 0, num_actions)
+        state, time_step = environment.step(step_key, state, action_B)
+        return state, (time_step.observation, time_step.reward, time_step.terminated)
+
+    @jax.jit
+    def play(state, key):
+        state, seen = jax.lax.scan(step, state, jax.random.split(key, RACE_STEPS))
+        return state, seen
+
+    state, _ = jax.jit(environment.reset)(jax.random.key(0))
+    holder = [state, jax.random.key(1)]
+
+    def go_on() -> None:
+        holder[1], key = jax.random.split(holder[1])
+        holder[0] = jax.block_until_ready(play(holder[0], key))[0]
+
+    for _ in range(3):  # past the first frames, where nothing has ended yet
+        go_on()
+    return go_on
+
+
+def cache_race(agent: Agent) -> Table:
+    """The last imagined step of a full context, with the key-value cache and by recomputing all frames."""
+    config, tokens = agent.config, agent.tokens
+    batch, length = config.imagination.num_envs, config.world_model.sequence_length
+    model: WorldModel = nnx.merge(agent.world_model_graph, agent.init(jax.random.key(0)).world_model.params)
+    graph, params = nnx.split(model)
+    frames = jax.random.randint(jax.random.key(1), (batch, length, tokens.tokens_per_frame), 0, tokens.num_codes)
+    actions = jax.random.randint(jax.random.key(2), (batch, length), 0, tokens.num_actions)
+    cache = model.init_cache(batch, length)
+    cache = cache.replace(index=jnp.int32(length - 1))
+
+    @jax.jit
+    def cached(params, cache):
+        hidden = nnx.merge(graph, params).step(cache, frames[:, -1], actions[:, -1])[1]
+        return nnx.merge(graph, params).observation_logits(hidden)
+
+    @jax.jit
+    def recomputed(params):
+        hidden = nnx.merge(graph, params)(frames, actions)
+        return nnx.merge(graph, params).observation_logits(hidden[:, -1])
+
+    jax.block_until_ready((cached(params, cache), recomputed(params)))
+    fast, slow = seconds_of(lambda: cached(params, cache)), seconds_of(lambda: recomputed(params))
+    return [
+        {"method": "key-value cache", "ms": 1e3 * fast, "times faster": slow / fast},
+        {"method": f"recomputing {length} frames", "ms": 1e3 * slow, "times faster": 1.0},
+    ]
+
+
+def start_up_race(config: Config) -> Table:
+    """Starts the same command in two new processes that share a cache folder, empty before the first.
+
+    The seconds are a whole process's: from its start until it has computed its first policy update.
+    """
+    rows: Table = []
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "SUITE_CACHE_DIR": f"{folder}/cache"}
+        for name in ("first start", "second start"):
+            start = time.perf_counter()
+            command = [sys.executable, "-m", "suite.races", json.dumps(config.as_dict())]
+            subprocess.run(command, env=environment, capture_output=True, check=True)
+            rows.append({"start": name, "seconds": time.perf_counter() - start})
+    for row in rows:
+        row["times faster"] = rows[0]["seconds"] / row["seconds"]
+    return rows
+
+
+def _first_training_step(config: Config) -> None:
+    """What `start_up_race` runs: the start of `suite.run`, up to the first policy update."""
+    enable_compilation_cache()
+    agent = Agent(config, registry.task(config.task).make()(None))
+    state = agent.init(jax.random.key(0))
+    player, trajectory, _ = agent.collect(state.learner.acting, state.player, jax.random.key(1))
+    if config.ppo.learn_from_real:
+        jax.block_until_ready(agent.learn(state.learner, trajectory))
+    jax.block_until_ready(player)
+
+
+if __name__ == "__main__":
+    _first_training_step(Config(**json.loads(sys.argv[1])))
