@@ -109,7 +109,7 @@ class RichReporter(QuietReporter):
         (start_time, start_steps), (end_time, end_steps) = self._history[0], self._history[-1]
         if end_steps > start_steps and end_time > start_time:
             speed = (end_steps - start_steps) / (end_time - start_time)
-            parts.append(f"{speed:,.0f} steps/s")
+            parts.append(f"{speed:,.0f} steps/s" if speed >= 10 else f"{speed:.2g} steps/s")
             if self._total > self._steps:
                 parts.append(f"{_duration((self._total - self._steps) / speed)} left")
         return " | ".join(part for part in parts if part)
