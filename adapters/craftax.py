@@ -68,7 +68,7 @@ def make_classic(progress: Callable[[str, float], None] | None = None) -> Enviro
 class CraftaxClassic:
     """One game of Craftax-classic; see `suite.interface.environment.Environment`.
 
-    Observations are uint8 [63, 63, 3]: craftax's float frames in [0, 1] times 255, rounded (fidelity note 14). The
+    Observations are uint8 [63, 63, 3]: craftax's frames before it divides them by 255, rounded (fidelity note 14). The
     reward is the game's own. An episode ends by death (terminated) or, alive, after `max_timesteps` (truncated).
 
     The state is craftax's `EnvState`. The statistics need none of their own: an achievement is never lost, and what
@@ -105,21 +105,79 @@ class CraftaxClassic:
         flags = {"terminated": over & ~truncated, "truncated": truncated, "first": jnp.zeros((), bool)}
         return stepped, self._time_step(stepped, _strong(reward, jnp.dtype(jnp.float32)), **flags)
 
-    def _time_step(self, state: Any, reward: jax.Array, **flags: jax.Array) -> TimeStep:
+    def _time_step(self, state: Any, reward: jax.Array, **flags: Any) -> TimeStep:
         observation = jnp.round(self._render(state)).astype(jnp.uint8)
-        statistics = {
-            "achievements": state.achievements,
-            "achievement_return": state.achievements.sum(dtype=jnp.float32),
-            "health_return": HEALTH_REWARD * (state.player_health - START_HEALTH).astype(jnp.float32),
-        }
         return TimeStep(
-            observation=observation, final_observation=observation, reward=reward, statistics=statistics, **flags
+            observation=observation,
+            final_observation=observation,
+            reward=reward,
+            statistics=_statistics(state),
+            **flags,
         )
+
+
+class BuiltInAutoReset:
+    """Craftax-classic with the package's own auto-reset and our renderer: what `suite bench` measures ours against.
+
+    A `BatchedEnvironment` that generates a world for every environment at every step. As in the package, an end is
+    not told from a time limit (always `terminated`), and an episode's last frame and statistics are lost.
+    """
+
+    spec = CLASSIC_SPEC
+
+    def __init__(self, num_envs: int):
+        from craftax.craftax_classic.envs.craftax_pixels_env import CraftaxClassicPixelsEnv
+
+        from adapters.craftax_renderer import make_renderer
+
+        class Game(CraftaxClassicPixelsEnv):
+            def __init__(self):  # not the package's own, which prepares textures for half a minute
+                self.static_env_params = self.default_static_params()
+                self._render_fn = make_renderer()
+
+        self.num_envs = num_envs
+        self._game = Game()
+
+    def reset(self, key: jax.Array) -> tuple[Any, TimeStep]:
+        """First time steps of B episodes; every array leads with B."""
+        with _craftax_numerics():
+            frame_B, state = jax.vmap(self._game.reset)(jax.random.split(key, self.num_envs))
+        state = jax.tree.map(_strong, state)
+        no_B = jnp.zeros(self.num_envs, bool)
+        return state, self._time_step(frame_B, state, jnp.zeros(self.num_envs), no_B, ~no_B)
+
+    def step(self, key: jax.Array, state: Any, action_B: jax.Array) -> tuple[Any, TimeStep]:
+        """One step of each environment, and B new worlds of which those that ended get theirs."""
+        keys_B = jax.random.split(key, self.num_envs)
+        with _craftax_numerics():
+            frame_B, stepped, reward_B, done_B, _ = jax.vmap(self._game.step)(keys_B, state, action_B)
+        stepped = jax.tree.map(lambda new, old: _strong(new, old.dtype), stepped, state)
+        return stepped, self._time_step(frame_B, stepped, _strong(reward_B, jnp.dtype(jnp.float32)), done_B, done_B)
+
+    def _time_step(self, frame_B, state, reward_B, terminated_B, first_B) -> TimeStep:
+        observation_B = jnp.round(frame_B * 255).astype(jnp.uint8)
+        return TimeStep(
+            observation=observation_B,
+            reward=reward_B,
+            terminated=terminated_B,
+            truncated=jnp.zeros(self.num_envs, bool),
+            first=first_B,
+            final_observation=observation_B,
+            statistics=jax.vmap(_statistics)(state),
+        )
+
+
+def _statistics(state: Any) -> dict[str, jax.Array]:
+    return {
+        "achievements": state.achievements,
+        "achievement_return": state.achievements.sum(dtype=jnp.float32),
+        "health_return": HEALTH_REWARD * (state.player_health - START_HEALTH).astype(jnp.float32),
+    }
 
 
 @contextlib.contextmanager
 def _craftax_numerics() -> Iterator[None]:
-    """craftax mixes types and ranks as NumPy does, whatever stricter rules the caller is traced under."""
+    """Craftax mixes types and ranks as NumPy does, whatever stricter rules the caller is traced under."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 

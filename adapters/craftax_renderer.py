@@ -21,19 +21,45 @@ CENTER = np.array(VIEW, np.int32) // 2
 MARGIN = max(VIEW)
 
 # By number of craftax's BlockType, whose second is plain gray and lies beyond the map's edge.
-BLOCKS = (
-    "debug_tile debug_tile grass water stone tree wood path coal iron diamond table furnace sand lava "
-    "plant_on_grass ripe_plant_on_grass"
-).split()
+BLOCKS = [
+    "debug_tile",
+    "debug_tile",
+    "grass",
+    "water",
+    "stone",
+    "tree",
+    "wood",
+    "path",
+    "coal",
+    "iron",
+    "diamond",
+    "table",
+    "furnace",
+    "sand",
+    "lava",
+    "plant_on_grass",
+    "ripe_plant_on_grass",
+]
 OUT_OF_BOUNDS, GRAY = 1, 128
 # The player's are in the order of the moves left, right, up, down. Four directions of the arrow follow.
-CREATURES = "player-left player-right player-up player-down player-sleep zombie cow skeleton".split()
+CREATURES = ["player-left", "player-right", "player-up", "player-down", "player-sleep", "zombie", "cow", "skeleton"]
 ASLEEP, ZOMBIE, COW, SKELETON, ARROW = 4, 5, 6, 7, 8
 # The slots of the inventory, row by row; where transparent, the last few are black.
-NEEDS = "health food drink energy".split()
-ITEMS = (
-    "sapling wood stone coal iron diamond wood_pickaxe stone_pickaxe iron_pickaxe wood_sword stone_sword iron_sword"
-).split()
+NEEDS = ["health", "food", "drink", "energy"]
+ITEMS = [
+    "sapling",
+    "wood",
+    "stone",
+    "coal",
+    "iron",
+    "diamond",
+    "wood_pickaxe",
+    "stone_pickaxe",
+    "iron_pickaxe",
+    "wood_sword",
+    "stone_sword",
+    "iron_sword",
+]
 CUT_OUT = {"stone_pickaxe", "iron_pickaxe", "wood_sword", "stone_sword", "iron_sword"}
 
 NIGHT, SLEEP = np.array([[[0, 16, 64]]], np.float32), np.array([[[0, 0, 16]]], np.float32)
@@ -66,7 +92,12 @@ def _draw_creatures(tiles: jax.Array, state: Any, color: jax.Array, alpha: jax.A
     down, right = state.arrow_directions[:, 0], state.arrow_directions[:, 1]
     arrows = ARROW + jnp.where((down > 0) | (right > 0), 1, 0) + jnp.where(right != 0, 2, 0)
     player = jnp.where(state.is_sleeping, ASLEEP, state.player_direction - 1)
-    groups = [(state.zombies, ZOMBIE), (state.cows, COW), (state.skeletons, SKELETON), (state.arrows, arrows)]
+    groups: list[tuple[Any, Any]] = [
+        (state.zombies, ZOMBIE),
+        (state.cows, COW),
+        (state.skeletons, SKELETON),
+        (state.arrows, arrows),
+    ]
     which = [player[None]] + [jnp.broadcast_to(sprite, mobs.mask.shape) for mobs, sprite in groups]
     position = [state.player_position[None]] + [mobs.position for mobs, _ in groups]
     alive = [jnp.ones(1, bool)] + [mobs.mask for mobs, _ in groups]
