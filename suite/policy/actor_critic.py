@@ -13,8 +13,6 @@ from suite.config import PolicyConfig
 from suite.interface.environment import ObservationSpec
 from suite.policy.networks import GRU, RELU_GAIN, DenseTrunk, ImpalaCNN, Norm, SymbolMLP, dense
 
-# Larger pictures are resized for the policy, so that the paper's sizes hold (fidelity note 4).
-MAX_PIXELS = (63, 63)
 # Finite, so that entropy and gradients stay finite; far enough for a probability of exactly zero.
 ILLEGAL = -1e9
 
@@ -24,8 +22,8 @@ class PolicyOutput:
     """What a policy says of each step.
 
     Attributes:
-      logits_TBA: float32, unnormalised log-probabilities of the actions.
-      value_TB: float32, the expected return in standardised units; see `ppo.TargetStatistics.denormalize`.
+      logits_TBA: float32, unnormalized log-probabilities of the actions.
+      value_TB: float32, the expected return in standardized units; see `ppo.TargetStatistics.denormalize`.
     """
 
     logits_TBA: jax.Array
@@ -48,8 +46,8 @@ class ActorCritic(nnx.Module):
             self.embed = SymbolMLP(symbols, observation.high + 1, config.hidden_size, dtype, rngs)
         else:
             height, width, channels = observation.shape
-            if observation.kind == "pixels" and (height > MAX_PIXELS[0] or width > MAX_PIXELS[1]):
-                self.resized = MAX_PIXELS
+            if observation.kind == "pixels" and max(height, width) > config.max_pixels:
+                self.resized = (min(height, config.max_pixels), min(width, config.max_pixels))
             self.embed = ImpalaCNN((*(self.resized or (height, width)), channels), config, dtype, rngs)
         self.memory = Memory(self.embed.features, config.rnn_size, dtype, rngs) if config.rnn_size else None
 
@@ -103,11 +101,11 @@ class ActorCritic(nnx.Module):
         return hidden_BH
 
     def _embed(self, observation_TB: jax.Array) -> jax.Array:
-        """z [T, B, F]; the CNN sees all T x B frames at once."""
+        """Embeddings z [T, B, F]; the CNN sees all T x B frames at once."""
         steps, batch = observation_TB.shape[:2]
         x_N = observation_TB.reshape(steps * batch, *observation_TB.shape[2:])
         if self.resized:
-            x_N = resize_nearest(x_N, self.resized)
+            x_N = jax.image.resize(x_N, (steps * batch, *self.resized, x_N.shape[-1]), "nearest")
         if not self.symbolic:
             x_N = x_N.astype(jnp.float32) / self.high
         return self.embed(x_N).reshape(steps, batch, self.embed.features)
@@ -125,7 +123,7 @@ class Memory(nnx.Module):
     def __call__(
         self, z_TBF: jax.Array, first_TB: jax.Array, hidden_BH: jax.Array, acting_TB: jax.Array | None
     ) -> tuple[jax.Array, jax.Array]:
-        """y [T, B, H] and the hidden state after the last step."""
+        """Outputs y [T, B, H] and the hidden state after the last step."""
         x_TBH = jax.nn.relu(self.input(self.norm(z_TBF)))
         output_TBH, hidden_BH = self.gru(x_TBH, first_TB, hidden_BH, acting_TB)
         return jax.nn.relu(self.output(output_TBH)), hidden_BH
@@ -168,7 +166,7 @@ Policy = ActorCritic | UniformPolicy
 
 
 def make_policy(config: PolicyConfig, observation: ObservationSpec, num_actions: int, rngs: nnx.Rngs) -> Policy:
-    """The policy that `config.kind` names, freshly initialised."""
+    """The policy that `config.kind` names, freshly initialized."""
     if config.kind == "uniform":
         return UniformPolicy(num_actions)
     return ActorCritic(config, observation, num_actions, rngs)
@@ -180,13 +178,5 @@ def mask_logits(logits: jax.Array, legal: jax.Array | None) -> jax.Array:
 
 
 def log_probability(logits: jax.Array, action: jax.Array) -> jax.Array:
-    """log pi(action) [...] under logits [..., A]; `action` int32 [...]."""
+    """Log-probability log pi(action) [...] under logits [..., A]; `action` int32 [...]."""
     return jnp.take_along_axis(jax.nn.log_softmax(logits), action[..., None], axis=-1)[..., 0]
-
-
-def resize_nearest(image_NHWC: jax.Array, size: tuple[int, int]) -> jax.Array:
-    """Images resized to (height, width) by the nearest pixel; values and dtype unchanged."""
-    height, width = size
-    rows = ((jnp.arange(height) + 0.5) * (image_NHWC.shape[1] / height)).astype(jnp.int32)
-    columns = ((jnp.arange(width) + 0.5) * (image_NHWC.shape[2] / width)).astype(jnp.int32)
-    return image_NHWC[:, rows][:, :, columns]

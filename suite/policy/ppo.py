@@ -1,4 +1,4 @@
-"""Proximal policy optimisation on a batch of trajectories, real or imagined (Appendix A.1.2, Algorithm 3).
+"""Proximal policy optimization on a batch of trajectories, real or imagined (Appendix A.1.2, Algorithm 3).
 
 Shapes: T steps, B environments, A actions, H memory units. In two-player games a step is an event; only where
 `acting_TB` is the decision ours. Other events pass their rewards back to our decision before them.
@@ -13,6 +13,19 @@ from flax import nnx, struct
 
 from suite.config import PPOConfig
 from suite.policy.actor_critic import PolicyOutput, log_probability, mask_logits
+
+# What `update` reports, in the order of tables and files.
+METRICS: tuple[str, ...] = (
+    "policy_loss",
+    "value_loss",
+    "entropy",
+    "approx_kl",
+    "clip_fraction",
+    "gradient_norm",
+    "explained_variance",
+    "target_mean",
+    "target_std",
+)
 
 
 @struct.dataclass
@@ -50,7 +63,7 @@ class Trajectory:
 
 
 def generalized_advantages(trajectory: Trajectory, discount: float, gae_lambda: float) -> jax.Array:
-    """Generalised advantage estimates [T, B] (Appendix A.1.2), 0 where the decision is not ours.
+    """Generalized advantage estimates [T, B] (Appendix A.1.2), 0 where the decision is not ours.
 
     `discount` and `gae_lambda` count our decisions, not events. Termination is worth nothing beyond; a truncation
     has the value of its last observation beyond, and the trace ends at both.
@@ -89,7 +102,7 @@ def generalized_advantages(trajectory: Trajectory, discount: float, gae_lambda: 
 
 @struct.dataclass
 class TargetStatistics:
-    """Moving averages that standardise value targets (Algorithm 3, fidelity notes 8 and 9).
+    """Moving averages that standardize value targets (Algorithm 3, fidelity notes 8 and 9).
 
     `mean`, `std` and `weight` (float32 scalars) all average from zero; dividing by `weight`, the average of ones,
     removes the bias towards zero. Before the first update the statistics are mean 0 and deviation 1.
@@ -135,16 +148,21 @@ class TargetStatistics:
 
 @struct.dataclass
 class Learner:
-    """All that learning a policy carries along: parameters, optimizer state, target statistics."""
+    """All that learning a policy carries along: parameters, optimizer state (None in `acting`), target statistics."""
 
     params: nnx.State
-    optimizer: optax.OptState
+    optimizer: optax.OptState | None
     targets: TargetStatistics
 
     @classmethod
     def create(cls, ppo: PPOConfig, optimizer: optax.GradientTransformation, params: nnx.State) -> Learner:
         """A fresh learner of `params`, the state of `nnx.split(policy)`."""
         return cls(params, optimizer.init(params), TargetStatistics.create(ppo.target_min_std))
+
+    @property
+    def acting(self) -> Learner:
+        """What acting needs: without the optimizer, so that training and evaluation share one compiled program."""
+        return self.replace(optimizer=None)
 
 
 def make_optimizer(ppo: PPOConfig, total_updates: int | None) -> optax.GradientTransformation:
@@ -166,9 +184,14 @@ def update(
 ) -> tuple[Learner, dict[str, jax.Array]]:
     """Algorithm 3: `epochs` passes over `minibatches` contiguous groups of environments, unshuffled (note 9).
 
-    Each minibatch runs the network over all T steps again, from `trajectory.hidden_BH`. `minibatches` must divide
-    B. Returns the learner and float32 scalar metrics, those of the loss averaged over all minibatch updates.
+    Each minibatch runs the network over all T steps again, from `trajectory.hidden_BH`. Returns the learner and
+    the float32 scalars that `METRICS` names, those of the loss averaged over all minibatch updates. Raises
+    ValueError if `minibatches` does not divide B.
     """
+    environments = trajectory.hidden_BH.shape[0]
+    if environments % minibatches:
+        raise ValueError(f"{minibatches} minibatches do not divide {environments} environments")
+    size = environments // minibatches
     advantage_TB = generalized_advantages(trajectory, ppo.discount, ppo.gae_lambda)
     mean, std, _ = _moments(advantage_TB, trajectory.acting_TB)
     batch = _Batch(
@@ -181,7 +204,6 @@ def update(
         acting_TB=trajectory.acting_TB,
         legal_TBA=trajectory.legal_TBA,
     )
-    size = trajectory.hidden_BH.shape[0] // minibatches
 
     def minibatch_update(learner: Learner, index: jax.Array):
         part, hidden_BH = _environments(batch, trajectory.hidden_BH, index * size, size)
@@ -194,8 +216,9 @@ def update(
             return _loss(ppo, output, part, entropy_coefficient)
 
         gradients, metrics = jax.grad(loss_of, has_aux=True)(learner.params)
-        metrics["gradient_norm"] = optax.global_norm(gradients)
-        changes, state = optimizer.update(gradients, learner.optimizer, learner.params)
+        metrics["gradient_norm"] = optax.tree.norm(gradients)
+        with jax.numpy_dtype_promotion("standard"):  # Optax raises floats to integer powers
+            changes, state = optimizer.update(gradients, learner.optimizer, learner.params)
         return Learner(optax.apply_updates(learner.params, changes), state, targets), metrics
 
     order = jnp.tile(jnp.arange(minibatches), epochs)
@@ -210,7 +233,7 @@ def update(
 
 @struct.dataclass
 class _Batch:
-    """What the loss needs of each step; `advantage_TB` is standardised, `target_TB` q = A + v."""
+    """What the loss needs of each step; `advantage_TB` is standardized, `target_TB` q = A + v."""
 
     observation_TB: jax.Array
     first_TB: jax.Array
@@ -232,8 +255,9 @@ def _loss(
     ppo: PPOConfig, output: PolicyOutput, batch: _Batch, entropy_coefficient: float
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The objective of Appendix A.1.2 as a mean over our decisions (note 10), and its parts."""
-    log_policy_TBA = jax.nn.log_softmax(mask_logits(output.logits_TBA, batch.legal_TBA))
-    log_ratio_TB = log_probability(log_policy_TBA, batch.action_TB) - batch.log_probability_TB
+    logits_TBA = mask_logits(output.logits_TBA, batch.legal_TBA)
+    log_policy_TBA = jax.nn.log_softmax(logits_TBA)
+    log_ratio_TB = log_probability(logits_TBA, batch.action_TB) - batch.log_probability_TB
     if batch.acting_TB is not None:
         # Someone else's event may be an action that we never take: keep its ratio finite.
         log_ratio_TB = jnp.where(batch.acting_TB, log_ratio_TB, 0.0)

@@ -1,0 +1,399 @@
+"""PPO: its arithmetic against plain NumPy, and that it learns."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx, struct
+
+from suite.agent import rollout as play
+from suite.config import PolicyConfig, PPOConfig
+from suite.interface.batching import Batched
+from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
+from suite.policy import ppo
+from suite.policy.actor_critic import log_probability, make_policy, mask_logits
+
+SYMBOLS = ObservationSpec((3,), 2, "symbols")
+TINY = PolicyConfig(hidden_size=8, rnn_size=4)
+ACTIONS = 3
+
+
+def random_trajectory(seed: int, steps: int = 6, batch: int = 4, *, turns: bool = False) -> ppo.Trajectory:
+    """Numbers with the right shapes; truncation and termination as they come, sometimes both."""
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape):
+        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+    terminated_TB, truncated_TB = jnp.asarray(rng.random((2, steps, batch)) < 0.2)
+    first_TB = jnp.concatenate([jnp.asarray(rng.random((1, batch)) < 0.5), (terminated_TB | truncated_TB)[:-1]])
+    legal_TBA = jnp.asarray(rng.random((steps, batch, ACTIONS)) < 0.7).at[..., 0].set(True)
+    return ppo.Trajectory(
+        observation_TB=jnp.asarray(rng.integers(0, 3, (steps, batch, 3)), jnp.uint8),
+        action_TB=jnp.zeros((steps, batch), jnp.int32) if turns else jnp.asarray(rng.integers(0, 3, (steps, batch))),
+        reward_TB=normal(steps, batch),
+        terminated_TB=terminated_TB,
+        truncated_TB=truncated_TB,
+        first_TB=first_TB,
+        log_probability_TB=-jnp.abs(normal(steps, batch)),
+        value_TB=normal(steps, batch),
+        hidden_BH=normal(batch, TINY.rnn_size),
+        last_value_B=normal(batch),
+        truncation_value_TB=jnp.where(truncated_TB, normal(steps, batch), 0.0),
+        acting_TB=jnp.asarray(rng.random((steps, batch)) < 0.6) if turns else None,
+        legal_TBA=legal_TBA if turns else None,
+    )
+
+
+def reference_advantages(t: ppo.Trajectory, discount: float, gae_lambda: float) -> np.ndarray:
+    """The definition, forwards: each decision looks for the next one of ours in its episode."""
+    reward, value, truncation_value = map(np.asarray, (t.reward_TB, t.value_TB, t.truncation_value_TB))
+    terminated, truncated = np.asarray(t.terminated_TB), np.asarray(t.truncated_TB)
+    steps, batch = reward.shape
+    acting = np.ones((steps, batch), bool) if t.acting_TB is None else np.asarray(t.acting_TB)
+    advantage = np.zeros((steps, batch))
+
+    def advantage_at(i, b):
+        total = 0.0
+        for j in range(i, steps):
+            if j > i and acting[j, b]:  # the next decision; everything in between was someone else's
+                error = total + discount * value[j, b] - value[i, b]
+                return error + discount * gae_lambda * advantage_at(j, b)
+            total += reward[j, b]
+            if terminated[j, b]:
+                return total - value[i, b]
+            if truncated[j, b]:
+                return total + discount * truncation_value[j, b] - value[i, b]
+        return total + discount * float(t.last_value_B[b]) - value[i, b]
+
+    for i, b in np.argwhere(acting):
+        advantage[i, b] = advantage_at(i, b)
+    return advantage
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_generalized_advantages_against_the_definition(turns):
+    advantages = jax.jit(ppo.generalized_advantages)
+    for seed in range(60):
+        t = random_trajectory(seed, turns=turns)
+        discount, gae_lambda = np.random.default_rng(seed).uniform(0, 1, 2)
+        expected = reference_advantages(t, discount, gae_lambda)
+        np.testing.assert_allclose(advantages(t, discount, gae_lambda), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_advantage_by_hand():
+    """gamma 0.5, lambda 0.5: A_1 = 3 + 0.5 * 2 - 1 = 3; A_0 = 1 + 0.5 * 1 - 4 + 0.25 * 3 = -1.75."""
+    t = random_trajectory(0, steps=2, batch=1)
+    no = jnp.zeros((2, 1), bool)
+    t = t.replace(
+        reward_TB=jnp.array([[1.0], [3.0]]),
+        value_TB=jnp.array([[4.0], [1.0]]),
+        last_value_B=jnp.array([2.0]),
+        terminated_TB=no,
+        truncated_TB=no,
+    )
+    np.testing.assert_allclose(ppo.generalized_advantages(t, 0.5, 0.5)[:, 0], [-1.75, 3.0])
+
+
+def test_target_statistics_against_numpy():
+    rng = np.random.default_rng(0)
+    statistics, mean, std = ppo.TargetStatistics.create(min_std=0.1), 0.0, 0.0
+    assert [float(x) for x in statistics.corrected()] == [0.0, 1.0]
+    for n in range(1, 6):
+        targets, mask = rng.normal(3.0, 2.0, (4, 3)).astype(np.float32), rng.random((4, 3)) < 0.6
+        masked = n % 2 == 0
+        seen = targets[mask] if masked else targets
+        mean, std = 0.9 * mean + 0.1 * seen.mean(), 0.9 * std + 0.1 * seen.std()
+        statistics = statistics.update(jnp.asarray(targets), jnp.asarray(mask) if masked else None, 0.9)
+        expected = mean / (1 - 0.9**n), std / (1 - 0.9**n)  # as Adam corrects its moments
+        np.testing.assert_allclose(statistics.corrected(), expected, rtol=1e-4)
+        standardized = statistics.standardize(jnp.asarray(targets))
+        np.testing.assert_allclose(standardized, (targets - expected[0]) / expected[1], rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(statistics.denormalize(standardized), targets, rtol=1e-4, atol=1e-4)
+
+
+def test_one_update_of_target_statistics_is_exactly_what_was_seen():
+    statistics = ppo.TargetStatistics.create().update(jnp.array([1.0, 3.0]), None, 0.95)
+    np.testing.assert_allclose(statistics.corrected(), (2.0, 1.0), rtol=1e-5)
+
+
+def test_deviation_of_targets_has_a_floor():
+    statistics = ppo.TargetStatistics.create(min_std=0.25).update(jnp.full(4, 7.0), None, 0.95)
+    np.testing.assert_allclose(statistics.corrected(), (7.0, 0.25), rtol=1e-5)
+
+
+def test_targets_of_nothing_change_nothing():
+    statistics = ppo.TargetStatistics.create().update(jnp.array([1.0, 3.0]), None, 0.5)
+    after = statistics.update(jnp.array([100.0, 5.0]), jnp.zeros(2, bool), 0.5)
+    np.testing.assert_array_equal(after.corrected(), statistics.corrected())
+
+
+@functools.cache
+def setup(config: PPOConfig, seed: int = 0):
+    """graphdef, optimizer and a fresh learner on `SYMBOLS`."""
+    network = nnx.jit(lambda: make_policy(TINY, SYMBOLS, ACTIONS, nnx.Rngs(seed)))()
+    network.policy_head.kernel[...] = 30.0 * network.policy_head.kernel[...]  # something to disagree with
+    graphdef, params = nnx.split(network)
+    optimizer = ppo.make_optimizer(config, None)
+    return graphdef, optimizer, ppo.Learner.create(config, optimizer, params)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def as_played(graphdef, learner, t: ppo.Trajectory) -> ppo.Trajectory:
+    """`t` with the log-probabilities and values that the learner's policy gives it."""
+    output, _ = nnx.merge(graphdef, learner.params)(t.observation_TB, t.first_TB, t.hidden_BH, t.acting_TB)
+    logits_TBA = mask_logits(output.logits_TBA, t.legal_TBA)
+    return t.replace(
+        log_probability_TB=log_probability(logits_TBA, t.action_TB),
+        value_TB=learner.targets.denormalize(output.value_TB),
+    )
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2), static_argnames=("epochs", "minibatches", "entropy_coefficient"))
+def run(config, graphdef, optimizer, learner, t, *, epochs=1, minibatches=1, entropy_coefficient=0.01):
+    plan = {"epochs": epochs, "minibatches": minibatches, "entropy_coefficient": entropy_coefficient}
+    return ppo.update(config, optimizer, graphdef, learner, t, **plan)
+
+
+def test_metrics_are_named():
+    config = PPOConfig()
+    graphdef, optimizer, learner = setup(config)
+    _, metrics = run(config, graphdef, optimizer, learner, random_trajectory(0), epochs=2, minibatches=2)
+    assert sorted(metrics) == sorted(ppo.METRICS)
+    assert all(value.shape == () and value.dtype == jnp.float32 for value in metrics.values())
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_first_minibatch_has_ratio_one(turns):
+    config = PPOConfig()
+    graphdef, optimizer, learner = setup(config)
+    t = as_played(graphdef, learner, random_trajectory(0, turns=turns))
+    _, metrics = run(config, graphdef, optimizer, learner, t)
+    assert metrics["clip_fraction"] == 0.0
+    assert metrics["approx_kl"] == pytest.approx(0.0, abs=1e-6)
+    assert metrics["policy_loss"] == pytest.approx(0.0, abs=1e-5)  # minus the mean of standardized advantages
+    fast = PPOConfig(learning_rate=0.1)
+    _, later = run(fast, graphdef, ppo.make_optimizer(fast, None), learner, t, epochs=4)
+    assert later["approx_kl"] > 1e-3 and later["clip_fraction"] > 0.0
+
+
+def reference_loss(config: PPOConfig, graphdef, learner, t: ppo.Trajectory, entropy_coefficient: float) -> dict:
+    """The losses of one minibatch that is the whole batch, in NumPy."""
+    output, _ = nnx.merge(graphdef, learner.params)(t.observation_TB, t.first_TB, t.hidden_BH, t.acting_TB)
+    mask = np.ones(t.action_TB.shape, bool) if t.acting_TB is None else np.asarray(t.acting_TB)
+    legal = np.ones((*mask.shape, ACTIONS), bool) if t.legal_TBA is None else np.asarray(t.legal_TBA)
+    logits = np.where(legal, np.asarray(output.logits_TBA), -np.inf)
+    policy = np.exp(logits - logits.max(-1, keepdims=True))
+    policy /= policy.sum(-1, keepdims=True)
+    advantage = reference_advantages(t, config.discount, config.gae_lambda)[mask]
+    target = advantage + np.asarray(t.value_TB)[mask]
+    target = (target - target.mean()) / max(target.std(), config.target_min_std)  # the first update: no history
+    advantage = (advantage - advantage.mean()) / advantage.std()
+    taken = np.take_along_axis(policy, np.asarray(t.action_TB)[..., None], -1)[..., 0][mask]
+    ratio = taken / np.exp(np.asarray(t.log_probability_TB)[mask])
+    gain = np.minimum(ratio * advantage, np.clip(ratio, 1 - config.clip, 1 + config.clip) * advantage)
+    entropy = -(policy * np.log(np.where(policy > 0, policy, 1.0))).sum(-1)[mask]
+    return {
+        "policy_loss": -gain.mean(),
+        "value_loss": np.square(np.asarray(output.value_TB)[mask] - target).mean(),
+        "entropy": entropy.mean(),
+        "clip_fraction": (np.abs(ratio - 1) > config.clip).mean(),
+    }
+
+
+@pytest.mark.parametrize("turns", [False, True])
+def test_losses_against_numpy(turns):
+    """With old log-probabilities that differ from the new, so that clipping is at work."""
+    config = PPOConfig()
+    graphdef, optimizer, learner = setup(config)
+    t = random_trajectory(3, turns=turns)
+    _, metrics = run(config, graphdef, optimizer, learner, t)
+    expected = reference_loss(config, graphdef, learner, t, 0.01)
+    assert 0 < expected["clip_fraction"] < 1
+    for name, value in expected.items():
+        assert metrics[name] == pytest.approx(value, rel=1e-3, abs=1e-4), name
+
+
+def changed(before: nnx.State, after: nnx.State) -> float:
+    return float(optax.tree.norm(jax.tree.map(jnp.subtract, before, after)))
+
+
+def test_events_of_others_teach_nothing():
+    """Their actions (even ones that we do not have), probabilities and values do not matter; the memory waits."""
+    config = PPOConfig()
+    graphdef, optimizer, learner = setup(config)
+    t = random_trajectory(5, turns=True)
+    theirs = ~t.acting_TB
+    other = t.replace(
+        action_TB=jnp.where(theirs, ACTIONS + 2, t.action_TB),
+        log_probability_TB=jnp.where(theirs, -500.0, t.log_probability_TB),
+        value_TB=jnp.where(theirs, 99.0, t.value_TB),
+        legal_TBA=t.legal_TBA & t.acting_TB[..., None],
+        observation_TB=jnp.where(theirs[..., None], jnp.uint8(0), t.observation_TB),
+    )
+    results = [run(config, graphdef, optimizer, learner, x, epochs=2, minibatches=2) for x in (t, other)]
+    (a, metrics), (b, other_metrics) = results
+    assert all(jnp.isfinite(value) for value in metrics.values())
+    assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(b.params))
+    assert changed(a.params, b.params) < 1e-5 < changed(a.params, learner.params)
+    np.testing.assert_allclose(metrics["value_loss"], other_metrics["value_loss"], rtol=1e-4)
+
+
+def test_a_batch_without_our_decisions_is_finite():
+    config = PPOConfig()
+    graphdef, optimizer, learner = setup(config)
+    t = random_trajectory(5, turns=True)
+    after, metrics = run(config, graphdef, optimizer, learner, t.replace(acting_TB=jnp.zeros_like(t.acting_TB)))
+    assert all(jnp.isfinite(value) for value in metrics.values())
+    assert changed(after.params, learner.params) == 0.0
+
+
+def test_minibatches_are_contiguous_groups_of_environments():
+    """Fidelity note 9. Two minibatches are two updates of halves, in order, given the advantages of the whole."""
+    config = PPOConfig(gae_lambda=0.0, discount=0.0)
+    graphdef, optimizer, learner = setup(config)
+    t = random_trajectory(1)
+    no = jnp.zeros_like(t.terminated_TB)
+    # Advantages are rewards here. Both halves have those of the whole, so that standardizing them apart is the same.
+    reward_TB = jnp.tile(t.reward_TB[:, :2], (1, 2))
+    t = t.replace(reward_TB=reward_TB, value_TB=jnp.zeros_like(reward_TB), terminated_TB=no, truncated_TB=no)
+    together, _ = run(config, graphdef, optimizer, learner, t, epochs=2, minibatches=2)
+
+    def part(start: int, stop: int) -> ppo.Trajectory:
+        by_environment = {"hidden_BH": t.hidden_BH[start:stop], "last_value_B": t.last_value_B[start:stop]}
+        steps = {
+            name: value[:, start:stop]
+            for name, value in vars(t).items()
+            if name not in by_environment and value is not None
+        }
+        return ppo.Trajectory(**steps, **by_environment)
+
+    in_order, swapped = learner, learner
+    for _ in range(2):
+        for start in (0, 2):
+            in_order, _ = run(config, graphdef, optimizer, in_order, part(start, start + 2))
+            swapped, _ = run(config, graphdef, optimizer, swapped, part(2 - start, 4 - start))
+    assert changed(together.params, in_order.params) < 1e-5
+    assert changed(together.params, swapped.params) > 1e-4
+    np.testing.assert_allclose(together.targets.corrected(), in_order.targets.corrected(), rtol=1e-5)
+
+
+def test_minibatches_must_divide_the_environments():
+    config = PPOConfig()
+    graphdef, optimizer, learner = setup(config)
+    with pytest.raises(ValueError, match="3 minibatches do not divide 4 environments"):
+        run(config, graphdef, optimizer, learner, random_trajectory(0), minibatches=3)
+
+
+def test_gradients_are_clipped_by_their_global_norm():
+    """Adam's first moment after one update is a tenth of the gradient that reached it."""
+    for limit, clipped in ((1e-3, True), (1e6, False)):
+        config = PPOConfig(max_grad_norm=limit)
+        graphdef, optimizer, learner = setup(config)
+        after, metrics = run(config, graphdef, optimizer, learner, random_trajectory(0))
+        moment = optax.tree_utils.tree_get(after.optimizer, "mu")
+        expected = limit if clipped else metrics["gradient_norm"]
+        assert metrics["gradient_norm"] > 1e-3
+        assert 10 * optax.tree.norm(moment) == pytest.approx(float(expected), rel=1e-3)
+
+
+@pytest.mark.parametrize("anneal", [True, False])
+def test_learning_rate_falls_linearly_to_zero(anneal):
+    """Fidelity note 11. Adam on a constant gradient moves by the rate itself."""
+    config = PPOConfig()
+    optimizer = ppo.make_optimizer(config, 4 if anneal else None)
+    params = {"x": jnp.zeros(())}
+    state, moves = optimizer.init(params), []
+    for _ in range(5):
+        with jax.numpy_dtype_promotion("standard"):
+            change, state = optimizer.update({"x": jnp.float32(0.3)}, state, params)
+        moves.append(-float(change["x"]))
+    fractions = [1, 0.75, 0.5, 0.25, 0] if anneal else [1] * 5
+    np.testing.assert_allclose(moves, 4.5e-4 * np.array(fractions), rtol=1e-3, atol=1e-12)
+
+
+def test_acting_needs_no_optimizer():
+    _, _, learner = setup(PPOConfig())
+    acting = learner.acting
+    assert acting.optimizer is None and acting.params is learner.params and acting.targets is learner.targets
+
+
+def test_several_seeds_learn_side_by_side():
+    config = PPOConfig()
+    graphdef, optimizer, _ = setup(config)
+    learners = [setup(config, seed)[2] for seed in (0, 1)]
+    trajectories = [random_trajectory(seed) for seed in (0, 1)]
+    stacked, batch = (jax.tree.map(lambda *x: jnp.stack(x), *trees) for trees in (learners, trajectories))
+    step = functools.partial(run, config, graphdef, optimizer, epochs=2, minibatches=2)
+    together, _ = jax.jit(jax.vmap(step))(stacked, batch)
+    for i in range(2):
+        alone, _ = step(learners[i], trajectories[i])
+        assert changed(jax.tree.map(lambda x, i=i: x[i], together.params), alone.params) < 1e-4
+
+
+CUE_LENGTH = 3
+
+
+@struct.dataclass
+class CueState:
+    cue: jax.Array
+    time: jax.Array
+
+
+class Cue:
+    """Shows one of two cues at time 0, blanks after; the action at the last step must name the cue (1 or -1)."""
+
+    spec = EnvironmentSpec("cue", ObservationSpec((1,), 2, "symbols"), 2, (-1.0, 0.0, 1.0))
+
+    def reset(self, key):
+        state = CueState(jax.random.randint(key, (), 0, 2), jnp.int32(0))
+        return state, self._show(state, jnp.float32(0), jnp.zeros((), bool), jnp.ones((), bool))
+
+    def step(self, key, state, action):
+        done = state.time == CUE_LENGTH - 1
+        reward = jnp.where(done, jnp.where(action == state.cue, 1.0, -1.0), 0.0)
+        state = state.replace(time=state.time + 1)
+        return state, self._show(state, reward, done, jnp.zeros((), bool))
+
+    def _show(self, state, reward, terminated, first):
+        observation = jnp.where(state.time == 0, 1 + state.cue, 0).astype(jnp.uint8)[None]
+        no = jnp.zeros((), bool)
+        return TimeStep(observation, reward, terminated, no, first, observation, {})
+
+
+def learn_cue(rnn_size: int, iterations: int = 60) -> float:
+    """The mean outcome of the last iterations' episodes, in [-1, 1]; 0 is chance."""
+    config = PPOConfig(learning_rate=3e-3, discount=0.9)
+    environment = Batched(Cue(), 32)
+    policy_config = PolicyConfig(hidden_size=32, rnn_size=rnn_size, dense_blocks=1)
+    new_policy = functools.partial(make_policy, policy_config, environment.spec.observation, 2)
+    graphdef, params = nnx.split(nnx.jit(lambda: new_policy(nnx.Rngs(0)))())
+    optimizer = ppo.make_optimizer(config, None)
+
+    def iteration(carry, key):
+        learner, player = carry
+        policy = nnx.merge(graphdef, learner.params)
+        player, trajectory, log = play.rollout(key, policy, learner.targets, environment, player, 4 * CUE_LENGTH)
+        learner, _ = run(config, graphdef, optimizer, learner, trajectory, epochs=4, minibatches=2)
+        return (learner, player), log.return_TB.mean(where=log.ended_TB)
+
+    @jax.jit
+    def train(params):
+        learner = ppo.Learner.create(config, optimizer, params)
+        player = play.start(nnx.merge(graphdef, params), environment, jax.random.key(1), burn_in=0)
+        return jax.lax.scan(iteration, (learner, player), jax.random.split(jax.random.key(2), iterations))[1]
+
+    return float(train(params)[-10:].mean())
+
+
+def test_ppo_learns_what_needs_memory():
+    assert learn_cue(rnn_size=16) > 0.9
+
+
+def test_without_memory_it_stays_at_chance():
+    assert abs(learn_cue(rnn_size=0)) < 0.15
