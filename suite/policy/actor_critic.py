@@ -41,6 +41,7 @@ class ActorCritic(nnx.Module):
         self.rnn_size, self.high, self.dtype = config.rnn_size, observation.high, dtype
         self.symbolic = observation.kind == "symbols"
         self.resized = None
+        self.embed: SymbolMLP | ImpalaCNN
         if self.symbolic:
             (symbols,) = observation.shape
             self.embed = SymbolMLP(symbols, observation.high + 1, config.hidden_size, dtype, rngs)
