@@ -11,11 +11,13 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+T = TypeVar("T")
 Positive = Annotated[int, Field(gt=0)]
 NotNegative = Annotated[int, Field(ge=0)]
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -24,8 +26,12 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 Rate = Annotated[float, Field(ge=0, lt=1)]
 ComputeType = Literal["auto", "float32", "bfloat16"]  # auto: bfloat16 on an accelerator, float32 on a CPU
 
-# `validate_default` so that a wrong number in this file fails at import, not in a run.
-config_class = dataclass(frozen=True, config=ConfigDict(extra="forbid", validate_default=True))
+
+@dataclass_transform(frozen_default=True)
+def config_class(cls: type[T]) -> type[T]:
+    """A frozen, validated dataclass; defaults too, so that a wrong one fails at import and not in a run."""
+    return dataclass(frozen=True, config=ConfigDict(extra="forbid", validate_default=True))(cls)
+
 
 
 @config_class
@@ -211,7 +217,7 @@ def hash_of(fields: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _problems(config: Config):
+def _problems(config: Config) -> Iterator[str]:
     """What no single field can say: sizes that must divide each other. Yields one line each."""
     env, ppo, model, dream = config.environment, config.ppo, config.world_model, config.imagination
     pairs = [
@@ -223,6 +229,8 @@ def _problems(config: Config):
     for name, value, of, total in pairs:
         if total % value:
             yield f"{name}={value} must divide {of}={total}"
+    if list(model.reward_classes or ()) != sorted(set(model.reward_classes or ())):
+        yield f"world_model.reward_classes={model.reward_classes} must ascend"
     if model.enabled and config.replay.capacity < 2 * config.steps_per_iteration:
         yield f"replay.capacity={config.replay.capacity} must hold two iterations ({2 * config.steps_per_iteration})"
     if model.enabled and env.rollout_length <= model.sequence_length:

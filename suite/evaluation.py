@@ -103,7 +103,7 @@ def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str
         enable_compilation_cache()
         agent = Agent(config, entry.make()(progress=reporter.texture))
         template = jax.eval_shape(agent.init, jax.random.key(0))
-        restored = checkpoint.restore_latest(folder / "checkpoints", _model_template(template))
+        restored = checkpoint.restore_latest(folder / "checkpoints", model_template(template))
         if restored is None:
             raise UserError(f"{folder} has no checkpoint to evaluate; run it first: suite run {config.task}")
         for warning in restored.warnings:
@@ -126,6 +126,6 @@ def evaluation_key(config: Config) -> jax.Array:
     return jax.random.fold_in(jax.random.key(config.seed), 1)
 
 
-def _model_template(state: Any) -> dict[str, Any]:
+def model_template(state: Any) -> dict[str, Any]:
     model = state.world_model
     return model_of(state.learner, state.tokenizer, None if model is None else model.params)

@@ -240,6 +240,10 @@ class RunRecord:
         """Adds evaluation episodes: as `append_episodes`, `step` being that of the checkpoint."""
         self._tables["evaluations"].append(rows)
 
+    def has_evaluation(self, step: int) -> bool:
+        """Whether there are evaluation episodes of the checkpoint at `step`."""
+        return any(row.startswith(f"{step},") for row in (self.folder / "evaluations.csv").read_text().splitlines())
+
     def append_metrics(self, row: Mapping[str, Any], names: Iterable[str] = ()) -> None:
         """Adds one iteration's metrics, `step` first.
 

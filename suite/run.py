@@ -26,6 +26,9 @@ from suite.reporting import Reporter
 from suite.world_model.training import WorldModelLearner
 
 
+PHASES = ("start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint")
+
+
 @dataclasses.dataclass(frozen=True)
 class Result:
     """What a run came to. `status`: "finished", "stopped" (by a signal) or "already finished"."""
@@ -71,6 +74,7 @@ class _Training:
         self.key = jax.random.key(self.config.seed)
         self.iteration = 0
         self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
+        self.recorded_seconds: dict[str, float] = {}  # of those, what timing.csv has
         self.stop_requested = False
 
     @property
@@ -91,6 +95,11 @@ class _Training:
                         self._save(state)
                 if self.iteration == self.config.iterations:
                     self._finish(state)
+                else:
+                    self.record.update(status="stopped")
+        except RunError:
+            self.record.update(status="failed")
+            raise
         finally:
             self.reporter.stop()
             self.record.add_wall_clock(time.monotonic() - started, self.seconds)
@@ -107,6 +116,7 @@ class _Training:
             self.reporter.warning(warning)
         self.iteration = restored.host["iteration"]
         self.seconds = restored.host["seconds"]
+        self.recorded_seconds = dict(self.seconds)
         self.record.rewind(self.steps)
         self.reporter.message(f"resuming at step {self.steps:,}")
         return _join(restored.model, restored.resume)
@@ -149,8 +159,15 @@ class _Training:
         mean_return = float(np.mean(returns)) if returns else None
         summary = {"reward_per_step": reward, "episodes": len(rows), "return": mean_return}
         self.record.append_metrics({"step": self.steps, **summary, **metrics}, agent.metric_names)
+        self._record_timing()
         self.reporter.update(self.steps, "", {} if mean_return is None else {"return": mean_return})
         return TrainState(learner, player, replay, tokenizer, world_model)
+
+    def _record_timing(self) -> None:
+        """Seconds per phase since the last iteration's row; the first compiles."""
+        since = {name: self.seconds.get(name, 0.0) - self.recorded_seconds.get(name, 0.0) for name in PHASES}
+        self.record.append_timing({"step": self.steps, **since})
+        self.recorded_seconds = dict(self.seconds)
 
     @contextlib.contextmanager
     def _phase(self, name: str) -> Iterator[None]:
@@ -183,9 +200,10 @@ class _Training:
         """Saves the last checkpoint, plays the final evaluation, and closes the record."""
         if checkpoint.latest_step(self.checkpoints) != self.steps:
             self._save(state)
-        with self._phase("evaluate"):
-            episodes = self.config.environment.num_envs
-            record_evaluation(self.record, self.agent, state.learner.acting, self.steps, episodes)
+        if not self.record.has_evaluation(self.steps):  # or an earlier process was killed right after it
+            with self._phase("evaluate"):
+                episodes = self.config.environment.num_envs
+                record_evaluation(self.record, self.agent, state.learner.acting, self.steps, episodes)
         self.record.finish(self.steps)
         checkpoint.drop_resume(self.checkpoints)
 

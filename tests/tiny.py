@@ -6,8 +6,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from suite.config import Config
 from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
 from suite.interface.turns import Turn
+from suite.overrides import apply_changes
+from suite.registry import Lazy, TaskEntry
 
 CORRIDOR_SPEC = EnvironmentSpec(
     id="corridor",
@@ -83,7 +86,7 @@ class Pennies:
         coin = jnp.where(player == 0, action // 2, coin)
         guess = jnp.where(player == 1, action, guess)
         done = player == 2
-        reward = jnp.where(done, jnp.where(coin == guess, 1.0, -1.0), 0.0)
+        reward = jnp.where(done, jnp.where(coin == guess, 1.0, -1.0), 0.0).astype(jnp.float32)
         state = jnp.stack([(player + 1) % 3, coin, guess])
         return state, self._show(state, reward, done, jnp.zeros((), bool))
 
@@ -99,3 +102,53 @@ class Pennies:
         )
         no = jnp.zeros((), bool)
         return TimeStep(observation, reward, terminated, no, first, observation, {}, turn)
+
+
+def make_corridor(progress=None) -> Corridor:
+    """As a task's factory."""
+    return Corridor()
+
+
+def corridor_smoke(config: Config) -> Config:
+    """Six iterations of 32 steps; imagination from the third."""
+    changes = {
+        "protocol.steps": 192,
+        "environment.num_envs": 4,
+        "environment.rollout_length": 8,
+        "environment.burn_in": 2,
+        "policy.cnn_channels": (4,),
+        "policy.blocks_per_stack": 1,
+        "policy.convs_per_block": 1,
+        "policy.hidden_size": 16,
+        "policy.dense_blocks": 1,
+        "policy.rnn_size": 8,
+        "ppo.minibatches": 2,
+        "ppo.epochs": 1,
+        "replay.capacity": 128,
+        "tokenizer.codebook_size": 8,
+        "tokenizer.updates": 1,
+        "world_model.embed_dim": 16,
+        "world_model.layers": 1,
+        "world_model.heads": 2,
+        "world_model.sequence_length": 4,
+        "world_model.sequences": 4,
+        "world_model.minibatches": 2,
+        "world_model.updates": 2,
+        "imagination.start_step": 96,
+        "imagination.horizon": 3,
+        "imagination.num_envs": 4,
+        "imagination.updates": 2,
+        "checkpoint.every_steps": 64,
+    }
+    return apply_changes(config, changes)
+
+
+CORRIDOR = TaskEntry(
+    id="corridor",
+    family="corridor",
+    summary="for tests",
+    spec=Lazy("tests.tiny:CORRIDOR_SPEC"),
+    make=Lazy("tests.tiny:make_corridor"),
+    scores=Lazy("leaderboards.scoring:craftax"),
+    presets={"smoke": Lazy("tests.tiny:corridor_smoke")},
+)

@@ -87,4 +87,5 @@ class Replay:
 
     def sample(self, state: ReplayState, key: jax.Array, batch: int, length: int) -> Experience:
         """`batch` sequences of `length` consecutive steps, uniform over all stored; leading axes [batch, length]."""
-        return self._buffer(batch, length).sample(state, key).experience
+        with jax.numpy_rank_promotion("allow"):  # flashbax broadcasts as NumPy does
+            return self._buffer(batch, length).sample(state, key).experience

@@ -42,6 +42,7 @@ class Tokenizer(Protocol):
 
     tokens_per_frame: int
     num_codes: int
+    metrics: tuple[str, ...]  # names of the scalars that `update` returns
 
     def init(self, key: jax.Array) -> TokenizerState:
         """A fresh state."""

@@ -91,7 +91,7 @@ class Conv3x3(nnx.Module):
     def __call__(self, x_NHWC: jax.Array) -> jax.Array:
         """[N, H, W, outputs] in `dtype`."""
         y_NHWC = convolve(x_NHWC.astype(self.dtype), self.kernel[...].astype(self.dtype))
-        return y_NHWC + self.bias[...].astype(self.dtype)
+        return y_NHWC + self.bias[...].astype(self.dtype)[None, None, None]
 
 
 class Norm(nnx.Module):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -43,12 +44,20 @@ class NearestNeighborTokenizer:
       threshold: squared Euclidean distance, of patches scaled to [0, 1], above which a patch becomes a code.
       patch: (height, width) of a patch; must fill the frame exactly, else ValueError.
       observation: the frames, of kind "pixels" or "grid".
+      metrics: names of what `update` returns.
     """
 
     codebook_size: int
     threshold: float
     patch: tuple[int, int]
     observation: ObservationSpec
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """What `update` reports."""
+        return ("codes", "new_codes", "mean_distance", "max_distance")
+
+    metrics: ClassVar[tuple[str, ...]] = ("codes", "new_codes", "mean_distance", "max_distance")
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -76,8 +85,8 @@ class NearestNeighborTokenizer:
     ) -> tuple[NearestNeighborState, dict[str, jax.Array]]:
         """Examines every patch in order and stores those farther than `threshold` from all codes before them.
 
-        Equal to examining them one after another, at the price of one iteration per new code. Metrics: `codes`,
-        `new_codes`, `mean_distance` and `max_distance` (squared, of all patches to their nearest code afterwards).
+        Equal to examining them one after another, at the price of one iteration per new code. The metrics'
+        distances are squared, of all patches to their nearest code afterwards.
         """
         patches_MP = split_patches(observation_NO, self.patch).reshape(-1, state.codes_KP.shape[-1])
         distance_M, _ = self._nearest(state, patches_MP)

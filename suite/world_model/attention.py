@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from suite.world_model.dropout import dropout
 
-GROUPS = 5
+GROUPS = 10
 
 
 def block_causal_attention(
@@ -47,14 +47,10 @@ def block_causal_attention(
     outputs = []
     for index, start in enumerate(range(0, blocks, size)):
         stop = min(start + size, blocks)
-        attend = functools.partial(_attend_run, first=start * block, block=block, dropout_rate=dropout_rate)
         key = None if dropout_key is None else jax.random.fold_in(dropout_key, index)
-        seen = slice(0, stop * block)
-        outputs.append(
-            jax.checkpoint(attend)(
-                query_BSNH[:, start * block : stop * block], key_BSNH[:, seen], value_BSNH[:, seen], key
-            )
-        )
+        queries, seen = slice(start * block, stop * block), slice(0, stop * block)
+        run = query_BSNH[:, queries], key_BSNH[:, seen], value_BSNH[:, seen], key
+        outputs.append(_attend_run(*run, start * block, block, dropout_rate))
     return jnp.concatenate(outputs, axis=1)
 
 
@@ -63,32 +59,75 @@ def cached_attention(
 ) -> jax.Array:
     """Attention of one block's queries to the first `filled` (int32 scalar) of the cached keys and values."""
     visible_QS = jnp.broadcast_to(jnp.arange(key_BSNH.shape[1]) < filled, (query_BQNH.shape[1], key_BSNH.shape[1]))
-    return _attend(query_BQNH, key_BSNH, value_BSNH, visible_QS)
+    mixed_BQNH, _ = _attend(query_BQNH, key_BSNH, value_BSNH, visible_QS)
+    return mixed_BQNH
 
 
-def _attend_run(query, key, value, dropout_key, *, first: int, block: int, dropout_rate: float) -> jax.Array:
+# Differentiated by hand, for the gradient needs neither the softmax's reductions nor anything of S * S once more:
+# with p the weights, o the output and dp the gradient of p, that of the scores is p * (dp - <do, o>).
+@functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5, 6))
+def _attend_run(query, key, value, dropout_key, first: int, block: int, rate: float) -> jax.Array:
     """Attention of a run of whole blocks, whose first query is token `first`, to everything up to its end."""
-    visible_QS = None
-    if query.shape[1] > block:
-        query_block = (first + jnp.arange(query.shape[1])) // block
-        key_block = jnp.arange(key.shape[1]) // block
-        visible_QS = query_block[:, None] >= key_block[None, :]
-    return _attend(query, key, value, visible_QS, dropout_rate, dropout_key)
+    return _run_forward(query, key, value, dropout_key, first, block, rate)[0]
 
 
-def _attend(query, key, value, visible_QS, dropout_rate: float = 0.0, dropout_key=None) -> jax.Array:
+def _run_forward(query, key, value, dropout_key, first: int, block: int, rate: float):
+    visible_QS = _visible(query.shape[1], key.shape[1], first, block)
+    mixed, log_total = _attend(query, key, value, visible_QS, rate, dropout_key)
+    return mixed, (query, key, value, dropout_key, mixed, log_total)
+
+
+def _run_backward(first: int, block: int, rate: float, saved, grad):
+    query, key, value, dropout_key, mixed, log_total_BNQ1 = saved
+    query_BNQH, key_BNSH, value_BNSH, mixed_BNQH, grad_BNQH = (
+        x.swapaxes(1, 2) for x in (query, key, value, mixed, grad)
+    )
+    scale, dtype = 1 / math.sqrt(query.shape[-1]), value.dtype
+    score_BNQS = _scores(query_BNQH * scale, key_BNSH, _visible(query.shape[1], key.shape[1], first, block))
+    weight_BNQS = jnp.exp(score_BNQS - log_total_BNQ1)
+    dropped_BNQS = dropout(weight_BNQS, rate, dropout_key).astype(dtype)
+    grad_value_BNHS = _product("bnqh,bnqs->bnhs", grad_BNQH, dropped_BNQS)  # of this shape: a CPU's fast path
+    grad_weight_BNQS = dropout(_product("bnqh,bnsh->bnqs", grad_BNQH, value_BNSH), rate, dropout_key)
+    along_BNQ1 = (grad_BNQH.astype(jnp.float32) * mixed_BNQH.astype(jnp.float32)).sum(-1, keepdims=True)
+    grad_score_BNQS = (weight_BNQS * (grad_weight_BNQS - along_BNQ1)).astype(dtype)
+    grad_query_BNQH = _product("bnqs,bnsh->bnqh", grad_score_BNQS, key_BNSH) * scale
+    grad_key_BNHS = _product("bnqh,bnqs->bnhs", query_BNQH * scale, grad_score_BNQS)
+    grads = (grad_query_BNQH, grad_key_BNHS.swapaxes(2, 3), grad_value_BNHS.swapaxes(2, 3))
+    return *(x.astype(dtype).swapaxes(1, 2) for x in grads), None
+
+
+_attend_run.defvjp(_run_forward, _run_backward)
+
+
+def _attend(query, key, value, visible_QS, rate: float = 0.0, dropout_key=None) -> tuple[jax.Array, jax.Array]:
+    """The mixed values [B, Q, N, H], and the logarithm of the softmax's denominator [B, N, Q, 1]."""
     # Heads before tokens: on a CPU the products are several times faster so. The weights are divided by their sum
     # after the product with the values, which is one pass fewer over the largest array.
     query_BNQH, key_BNSH, value_BNSH = (x.swapaxes(1, 2) for x in (query / math.sqrt(query.shape[-1]), key, value))
-    score_BNQS = jnp.einsum("bnqh,bnsh->bnqs", query_BNQH, key_BNSH, preferred_element_type=jnp.float32)
-    if visible_QS is not None:
-        score_BNQS = jnp.where(visible_QS[None, None], score_BNQS, -jnp.inf)
-    largest_BNQ1 = jax.lax.stop_gradient(score_BNQS.max(-1, keepdims=True))
+    score_BNQS = _scores(query_BNQH, key_BNSH, visible_QS)
+    largest_BNQ1 = score_BNQS.max(-1, keepdims=True)
     weight_BNQS = jnp.exp(score_BNQS - largest_BNQ1)
-    total_BNQ1 = weight_BNQS.sum(-1, keepdims=True)
-    weight_BNQS = dropout(weight_BNQS, dropout_rate, dropout_key).astype(value.dtype)
-    mixed_BNQH = jnp.einsum("bnqs,bnsh->bnqh", weight_BNQS, value_BNSH, preferred_element_type=jnp.float32)
-    return (mixed_BNQH / total_BNQ1).astype(value.dtype).swapaxes(1, 2)
+    # A product: on a CPU, row sums are several times slower.
+    total_BNQ1 = jnp.dot(weight_BNQS, jnp.ones((weight_BNQS.shape[-1], 1)))
+    mixed_BNQH = _product("bnqs,bnsh->bnqh", dropout(weight_BNQS, rate, dropout_key).astype(value.dtype), value_BNSH)
+    mixed_BQNH = (mixed_BNQH / total_BNQ1).astype(value.dtype).swapaxes(1, 2)
+    return mixed_BQNH, largest_BNQ1 + jnp.log(total_BNQ1)
+
+
+def _scores(query_BNQH: jax.Array, key_BNSH: jax.Array, visible_QS: jax.Array | None) -> jax.Array:
+    score_BNQS = _product("bnqh,bnsh->bnqs", query_BNQH, key_BNSH)
+    return score_BNQS if visible_QS is None else jnp.where(visible_QS[None, None], score_BNQS, -jnp.inf)
+
+
+def _visible(queries: int, keys: int, first: int, block: int) -> jax.Array | None:
+    """bool [Q, S]: which keys each query of a run sees; None: all of them."""
+    if queries == block:
+        return None
+    return ((first + jnp.arange(queries)) // block)[:, None] >= (jnp.arange(keys) // block)[None, :]
+
+
+def _product(spec: str, left: jax.Array, right: jax.Array) -> jax.Array:
+    return jnp.einsum(spec, left, right, preferred_element_type=jnp.float32)
 
 
 def block_positions(

@@ -13,7 +13,27 @@ from suite.config import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.world_model.transformer import WorldModel
 
+METRICS: tuple[str, ...] = (
+    "loss",
+    "observation_loss",
+    "token_accuracy",
+    "changed_token_accuracy",
+    "reward_loss",
+    "reward_accuracy",
+    "termination_loss",
+    "gradient_norm",
+)
 CHUNK_LOGITS = 2**25  # observation logits held at once: 128 MiB
+METRICS = (
+    "loss",
+    "observation_loss",
+    "reward_loss",
+    "termination_loss",
+    "token_accuracy",
+    "changed_token_accuracy",
+    "reward_accuracy",
+    "grad_norm",
+)  # names of what `update` returns
 
 
 @struct.dataclass
@@ -94,7 +114,7 @@ def update(
     sequences: Sequences,
     key: jax.Array,
 ) -> tuple[WorldModelLearner, dict[str, jax.Array]]:
-    """One gradient step; the metrics are `losses`', `loss` and `grad_norm` (before clipping)."""
+    """One gradient step; the metrics are `losses`', `loss` and `gradient_norm` (before clipping)."""
 
     def loss(params: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
         return losses(nnx.merge(graphdef, params), sequences, config, spec, key)
@@ -102,7 +122,7 @@ def update(
     (value, metrics), grads = jax.value_and_grad(loss, has_aux=True)(learner.params)
     with jax.numpy_dtype_promotion("standard"):  # Optax's Adam mixes int32 and float
         updates, state = optimizer.update(grads, learner.optimizer, learner.params)
-    metrics |= {"loss": value, "grad_norm": optax.global_norm(grads)}
+    metrics |= {"loss": value, "gradient_norm": optax.tree.norm(grads)}
     return WorldModelLearner(optax.apply_updates(learner.params, updates), state), metrics
 
 

@@ -1,0 +1,192 @@
+"""Whole runs on a tiny task: resuming, stopping, diverging, evaluating."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+
+from suite import checkpoint, evaluation, registry, run
+from suite.agent.dyna import Agent
+from suite.errors import RunError, UserError
+from suite.reporting import QuietReporter
+from tests.tiny import CORRIDOR, Corridor
+
+
+@pytest.fixture(autouse=True)
+def corridor(monkeypatch):
+    monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR))
+
+
+class StopAt(QuietReporter):
+    """Sends this process a signal when a phase begins for the n-th time: as a user, or a cluster, would."""
+
+    def __init__(self, phase: str, times: int):
+        super().__init__()
+        self.phase, self.times = phase, times
+
+    def update(self, steps, phase, fields):
+        if phase == self.phase:
+            self.times -= 1
+            if self.times == 0:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+
+class Killed(Exception):
+    pass
+
+
+class KillAt(StopAt):
+    """Ends the run on the spot, as `kill -9` does: nothing more is written."""
+
+    def update(self, steps, phase, fields):
+        if phase == self.phase:
+            self.times -= 1
+            if self.times == 0:
+                raise Killed
+
+
+def config(agent: str = "m5", *overrides: str, seed: int = 0):
+    return registry.resolve("corridor", agent, "smoke", overrides, seed)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """What must not depend on how often a run was stopped."""
+    names = ("config.json", "episodes.csv", "metrics.csv", "evaluations.csv")
+    return {name: (folder / name).read_bytes() for name in names}
+
+
+def last_model(folder: Path, settings):
+    agent = Agent(settings, Corridor())
+    template = evaluation.model_template(jax.eval_shape(agent.init, jax.random.key(0)))
+    restored = checkpoint.restore_latest(folder / "checkpoints", template)
+    return [np.asarray(x) for x in jax.tree.leaves(restored.model)]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR))
+        result = run.run(config(), tmp_path_factory.mktemp("whole"), QuietReporter())
+    assert result.status == "finished"
+    return result
+
+
+def assert_same(result, uninterrupted):
+    assert result.status == "finished"
+    assert files(result.folder) == files(uninterrupted.folder)
+    for mine, theirs in zip(last_model(result.folder, config()), last_model(uninterrupted.folder, config()), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    assert result.scores == uninterrupted.scores
+
+
+@pytest.mark.parametrize(("phase", "times"), [("collect", 3), ("imagine", 2)])
+def test_a_stopped_and_resumed_run_is_an_uninterrupted_one(tmp_path, uninterrupted, phase, times):
+    stopped = run.run(config(), tmp_path, StopAt(phase, times))
+    assert stopped.status == "stopped"
+    assert 0 < stopped.steps < config().total_steps
+    assert_same(run.run(config(), tmp_path, QuietReporter(), resume=True), uninterrupted)
+
+
+PHASES = ["start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint", "evaluate"]
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path, uninterrupted, phase):
+    late = {"start": 1, "checkpoint": 2, "evaluate": 1, "imagine": 2}.get(phase, 5)
+    with pytest.raises(Killed):
+        run.run(config(), tmp_path, KillAt(phase, late))
+    result = run.run(config(), tmp_path, QuietReporter())
+    assert_same(result, uninterrupted)
+
+
+def test_what_is_played_again_was_recorded_first_and_is_kept(tmp_path):
+    with pytest.raises(Killed):
+        run.run(config(), tmp_path, KillAt("collect", 4))  # three iterations recorded, a checkpoint after two
+    result = run.run(config(), tmp_path, QuietReporter())
+    aside = list((result.folder / "replaced").glob("*/metrics.csv"))
+    assert len(aside) == 1
+    replaced = pd.read_csv(aside[0])
+    metrics = pd.read_csv(result.folder / "metrics.csv")
+    assert replaced["step"].tolist() == [96]
+    pd.testing.assert_frame_equal(replaced, metrics[metrics["step"] == 96].reset_index(drop=True))
+
+
+def test_a_finished_run_is_not_run_again(uninterrupted):
+    before = files(uninterrupted.folder)
+    again = run.run(config(), uninterrupted.folder.parents[3], QuietReporter())
+    assert again.status == "already finished"
+    assert again.scores == uninterrupted.scores
+    assert files(uninterrupted.folder) == before
+
+
+def test_records_are_complete(uninterrupted):
+    fields = json.loads((uninterrupted.folder / "record.json").read_text())
+    assert fields["status"] == "finished"
+    assert fields["steps"] == 192
+    assert {"collect", "learn", "tokenizer", "world_model", "imagine", "evaluate", "total"} <= set(fields["wall_clock_seconds"])
+    metrics = pd.read_csv(uninterrupted.folder / "metrics.csv")
+    assert metrics["step"].tolist() == [32, 64, 96, 128, 160, 192]
+    assert metrics["imagine/policy_loss"].notna().tolist() == [False, False, True, True, True, True]
+    assert metrics["world_model/observation_loss"].iloc[-1] < metrics["world_model/observation_loss"].iloc[0]
+    episodes = pd.read_csv(uninterrupted.folder / "episodes.csv")
+    assert (episodes["return"] == episodes["arrive"]).all()
+    assert (episodes["length"] <= 6).all()
+    assert not (uninterrupted.folder / "checkpoints" / "step_000000000192" / "resume").exists()
+
+
+def test_the_first_episodes_of_an_evaluation_are_whole(uninterrupted):
+    scores = evaluation.evaluate(uninterrupted.folder, 10, QuietReporter())
+    assert scores["step"] == 192
+    assert scores["episodes"] == 12  # three rounds of four environments
+    rows = pd.read_csv(uninterrupted.folder / "evaluations.csv")
+    assert len(rows) == 4 + 12  # the run's own, and these
+
+
+def test_without_a_world_model_nothing_of_it_exists(tmp_path):
+    result = run.run(config("mfrl"), tmp_path, QuietReporter())
+    columns = pd.read_csv(result.folder / "metrics.csv").columns
+    assert not any(name.startswith(("tokenizer", "world_model", "imagine")) for name in columns)
+    assert "learn/entropy" in columns
+
+
+def test_random_learns_nothing(tmp_path):
+    result = run.run(config("random"), tmp_path, QuietReporter())
+    assert list(pd.read_csv(result.folder / "metrics.csv").columns) == ["step", "reward_per_step", "episodes", "return"]
+
+
+def test_seeds_differ(tmp_path):
+    first, second = (run.run(config("random", seed=seed), tmp_path, QuietReporter()) for seed in (0, 1))
+    assert files(first.folder)["episodes.csv"] != files(second.folder)["episodes.csv"]
+
+
+def test_a_diverged_loss_stops_the_run_and_says_where(tmp_path):
+    settings = config("mfrl", "ppo.learning_rate=1e30", "ppo.max_grad_norm=1e30")
+    with pytest.raises(RunError, match=r"learn/.* became .* in phase learn at step \d+"):
+        run.run(settings, tmp_path, QuietReporter())
+
+
+def test_a_broken_checkpoint_gives_way_to_the_one_before(tmp_path, uninterrupted):
+    with pytest.raises(Killed):
+        run.run(config(), tmp_path, KillAt("collect", 6))
+    folder = next(tmp_path.glob("*/*/*/seed_0"))
+    newest = max((folder / "checkpoints").glob("step_*"))
+    file = max((newest / "resume").rglob("*"), key=lambda path: path.stat().st_size if path.is_file() else 0)
+    file.write_bytes(file.read_bytes()[:-1])
+    warned = []
+    reporter = QuietReporter()
+    reporter.warning = warned.append
+    assert_same(run.run(config(), tmp_path, reporter), uninterrupted)
+    assert len(warned) == 1
+    assert "damaged" in warned[0]
+
+
+def test_resume_without_a_run_is_an_error(tmp_path):
+    with pytest.raises(UserError, match="nothing to resume"):
+        run.run(config(), tmp_path, QuietReporter(), resume=True)
