@@ -17,10 +17,11 @@ def paper(config: Config) -> Config:
 
 
 CRAFTAX_CLASSIC_SMALL: dict[str, Any] = {
-    "protocol.steps": 100_000,
+    "protocol.steps": 40_960,  # 40 iterations of 16 x 64
+    "protocol.final_fraction": 0.2,
     "environment.num_envs": 16,
     "environment.rollout_length": 64,
-    "policy.max_pixels": 27,
+    "policy.max_pixels": 27,  # three pixels a tile
     "policy.cnn_channels": (16, 32, 32),
     "policy.blocks_per_stack": 1,
     "policy.convs_per_block": 1,
@@ -30,20 +31,21 @@ CRAFTAX_CLASSIC_SMALL: dict[str, Any] = {
     "ppo.minibatches": 4,
     "ppo.epochs": 3,
     "replay.capacity": 32_000,
-    "tokenizer.codebook_size": 1024,
+    "tokenizer.codebook_size": 512,
     "tokenizer.updates": 5,
     "world_model.embed_dim": 64,
     "world_model.layers": 2,
     "world_model.heads": 4,
-    "world_model.sequence_length": 10,
-    "world_model.sequences": 24,
-    "world_model.minibatches": 3,
-    "world_model.updates": 20,
-    "imagination.start_step": 40_000,
-    "imagination.horizon": 10,
-    "imagination.num_envs": 16,
-    "imagination.updates": 20,
-    "checkpoint.every_steps": 25_000,
+    "world_model.sequence_length": 5,
+    "world_model.sequences": 16,
+    "world_model.minibatches": 2,
+    "world_model.updates": 25,
+    "world_model.dropout": 0.0,
+    "imagination.start_step": 25_000,
+    "imagination.horizon": 5,
+    "imagination.num_envs": 32,
+    "imagination.updates": 5,
+    "checkpoint.every_steps": 10_000,
 }
 
 CRAFTAX_CLASSIC_SMOKE: dict[str, Any] = {

@@ -40,7 +40,9 @@ def bench(config: Config, reporter: Reporter, start_up: bool = True) -> dict[str
         world_model=dataclasses.replace(config.world_model, updates=min(MODEL_UPDATES, config.world_model.updates)),
     )
     reporter.message("measuring the device's matrix products")
-    peak = {kind: matmul_rate(kind) for kind in {config.policy.compute_type, config.world_model.compute_type}}
+    peak: dict[str, float] = {
+        kind: matmul_rate(kind) for kind in {config.policy.compute_type, config.world_model.compute_type}
+    }
     report: dict[str, Any] = {f"matrix products, {kind} (GFLOP/s)": rate / 1e9 for kind, rate in peak.items()}
     agent = Agent(measured, environment)
     phases = phase_table(agent, config, peak, reporter)
@@ -102,6 +104,7 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
         return holder[0]
 
     policy_type, model_type = config.policy.compute_type, config.world_model.compute_type
+
     def collect(player: Any, key: jax.Array) -> Any:
         return agent.collect(state.learner.acting, player, key)
 
@@ -113,7 +116,7 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
         learner, _ = measure("learn", agent.learn, learner, (trajectory,), 1, policy_type)
     if replay is not None:
         scale = config.tokenizer.updates / max(1, agent.config.tokenizer.updates)
-        arguments = (replay, keys[2])
+        arguments: tuple[Any, ...] = (replay, keys[2])
         tokenizer, _ = measure("tokenizer", agent.update_tokenizer, state.tokenizer, arguments, scale, model_type)
         scale = config.world_model.updates / max(1, agent.config.world_model.updates)
         arguments = (tokenizer, replay, keys[3])

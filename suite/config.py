@@ -30,8 +30,7 @@ ComputeType = Literal["auto", "float32", "bfloat16"]  # auto: bfloat16 on an acc
 @dataclass_transform(frozen_default=True)
 def config_class(cls: type[T]) -> type[T]:
     """A frozen, validated dataclass; defaults too, so that a wrong one fails at import and not in a run."""
-    return dataclass(frozen=True, config=ConfigDict(extra="forbid", validate_default=True))(cls)
-
+    return dataclass(frozen=True, config=ConfigDict(extra="forbid", validate_default=True))(cls)  # type: ignore[return-value]
 
 
 @config_class

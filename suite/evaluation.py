@@ -127,5 +127,6 @@ def evaluation_key(config: Config) -> jax.Array:
 
 
 def model_template(state: Any) -> dict[str, Any]:
+    """`model_of` a whole `TrainState`, or of its shapes."""
     model = state.world_model
     return model_of(state.learner, state.tokenizer, None if model is None else model.params)

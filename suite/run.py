@@ -25,7 +25,6 @@ from suite.record import RunRecord, disk_full_is_an_error, run_folder
 from suite.reporting import Reporter
 from suite.world_model.training import WorldModelLearner
 
-
 PHASES = ("start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint")
 
 
@@ -123,7 +122,8 @@ class _Training:
 
     def _iterate(self, state: TrainState) -> TrainState:
         """One iteration of Algorithm 1. Randomness depends only on the seed and the iteration."""
-        agent, config, metrics = self.agent, self.config, {}
+        agent, config = self.agent, self.config
+        metrics: dict[str, float] = {}
         keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(self.key, 2), self.iteration), 4)
         learner, player, replay = state.learner, state.player, state.replay
         tokenizer, world_model = state.tokenizer, state.world_model

@@ -13,7 +13,10 @@ def test_products_loops_and_branches():
     once = 2 * 3 * 4 * 5
     assert count_flops(jnp.dot, a, b) == once
     assert count_flops(jax.jit(lambda a, b: jax.lax.scan(lambda c, _: (c, a @ b), 0, length=7)), a, b) == 7 * once
-    assert count_flops(lambda a, b: jax.lax.fori_loop(0, a.sum().astype(int), lambda i, c: c + a @ b, a @ b), a, b) == 2 * once
+    assert (
+        count_flops(lambda a, b: jax.lax.fori_loop(0, a.sum().astype(int), lambda i, c: c + a @ b, a @ b), a, b)
+        == 2 * once
+    )
     branches = lambda a, b: jax.lax.cond(a.sum() > 0, lambda: a @ b, lambda: (a @ b) @ (b.T @ b))  # noqa: E731
     assert count_flops(branches, a, b) == once + 2 * 5 * 4 * 5 + 2 * 3 * 5 * 5
 

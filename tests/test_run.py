@@ -38,7 +38,7 @@ class StopAt(QuietReporter):
                 os.kill(os.getpid(), signal.SIGTERM)
 
 
-class Killed(Exception):
+class Killed(Exception):  # noqa: N818 -- no error of the run's
     pass
 
 
@@ -81,7 +81,8 @@ def uninterrupted(tmp_path_factory):
 def assert_same(result, uninterrupted):
     assert result.status == "finished"
     assert files(result.folder) == files(uninterrupted.folder)
-    for mine, theirs in zip(last_model(result.folder, config()), last_model(uninterrupted.folder, config()), strict=True):
+    mine_and_theirs = (last_model(run.folder, config()) for run in (result, uninterrupted))
+    for mine, theirs in zip(*mine_and_theirs, strict=True):
         np.testing.assert_array_equal(mine, theirs)
     assert result.scores == uninterrupted.scores
 
@@ -130,7 +131,9 @@ def test_records_are_complete(uninterrupted):
     fields = json.loads((uninterrupted.folder / "record.json").read_text())
     assert fields["status"] == "finished"
     assert fields["steps"] == 192
-    assert {"collect", "learn", "tokenizer", "world_model", "imagine", "evaluate", "total"} <= set(fields["wall_clock_seconds"])
+    assert {"collect", "learn", "tokenizer", "world_model", "imagine", "evaluate", "total"} <= set(
+        fields["wall_clock_seconds"]
+    )
     metrics = pd.read_csv(uninterrupted.folder / "metrics.csv")
     assert metrics["step"].tolist() == [32, 64, 96, 128, 160, 192]
     assert metrics["imagine/policy_loss"].notna().tolist() == [False, False, True, True, True, True]

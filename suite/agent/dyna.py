@@ -6,6 +6,7 @@ state is one pytree of arrays, so that several seeds can become its leading axis
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -18,10 +19,11 @@ from suite.agent.replay import Replay, ReplayState
 from suite.config import Config
 from suite.interface.batching import Batched
 from suite.interface.environment import Environment, EnvironmentSpec
-from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec
+from suite.interface.tokens import TokenizerState, TokenSpec
 from suite.policy import ppo
 from suite.policy.actor_critic import make_policy
 from suite.tokenizers import make_tokenizer
+from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
 from suite.world_model import training as world_model_training
 from suite.world_model.imagination import Dream
 from suite.world_model.transformer import WorldModel
@@ -47,7 +49,9 @@ class TrainState:
     world_model: world_model_training.WorldModelLearner | None = None
 
 
-def build_tokenizer(config: Config, spec: EnvironmentSpec) -> tuple[Tokenizer, TokenSpec, tuple[int, int] | None]:
+def build_tokenizer(
+    config: Config, spec: EnvironmentSpec
+) -> tuple[NearestNeighborTokenizer, TokenSpec, tuple[int, int]]:
     """The tokenizer, the token stream it makes for the world model, and the patches' (rows, columns)."""
     tokenizer = make_tokenizer(config.tokenizer, spec.observation)
     tokens = TokenSpec(
@@ -113,7 +117,8 @@ class Agent:
         if not self.config.world_model.enabled:
             return state
         model_params = nnx.state(self._new_world_model(nnx.Rngs(model_key)))
-        return state.replace(
+        return dataclasses.replace(
+            state,
             replay=self.replay.init(self.spec),
             tokenizer=self.tokenizer.init(tokenizer_key),
             world_model=world_model_training.WorldModelLearner(
@@ -244,12 +249,11 @@ class Agent:
         sample_key, start_key, rollout_key = jax.random.split(key, 3)
         past = self.replay.sample(replay, sample_key, plan.num_envs, self.config.environment.burn_in + 1)
         past = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), past)
-        dream = Dream(
-            model, self.tokenizer, tokenizer, self.spec, self.tokens, plan.horizon, past.observation[-1]
-        )
+        dream = Dream(model, self.tokenizer, tokenizer, self.spec, self.tokens, plan.horizon, past.observation[-1])
         player = play.start(policy, dream, start_key, 0)
-        player = player.replace(
-            time_step=player.time_step.replace(first=past.first[-1]),
+        player = dataclasses.replace(
+            player,
+            time_step=dataclasses.replace(player.time_step, first=past.first[-1]),
             recent=play.Recent(past.observation[:-1], past.first[:-1], player.hidden_BH),
         )
         player = play.refresh(policy, player, carried=False)

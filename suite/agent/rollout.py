@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -99,7 +100,7 @@ def refresh(policy: Any, player: Player, *, carried: bool) -> Player:
         return player
     hidden_BH = recent.hidden_BH if carried else jnp.zeros_like(recent.hidden_BH)
     hidden_BH = policy.advance(recent.observation_MB, recent.first_MB, hidden_BH, recent.acting_MB)
-    return player.replace(hidden_BH=hidden_BH)
+    return dataclasses.replace(player, hidden_BH=hidden_BH)
 
 
 def rollout(
@@ -164,7 +165,8 @@ def rollout(
             legal_TBA=None if turn is None else turn.legal_A,
         )
         log = EpisodeLog(ended_B, return_B, length_B, after.statistics)
-        player = player.replace(
+        player = dataclasses.replace(
+            player,
             state=state,
             time_step=after,
             hidden_BH=hidden_BH,
@@ -177,7 +179,7 @@ def rollout(
     player, (steps, log) = jax.lax.scan(event, player, jax.random.split(key, length))
     memory_TBH = steps.hidden_BH  # before each step; PPO needs the first, burn-in the one M steps ago
     last, _ = policy(player.time_step.observation[None], player.time_step.first[None], player.hidden_BH)
-    trajectory = steps.replace(hidden_BH=memory_TBH[0], last_value_B=targets.denormalize(last.value_TB[0]))
+    trajectory = dataclasses.replace(steps, hidden_BH=memory_TBH[0], last_value_B=targets.denormalize(last.value_TB[0]))
     if burn_in := start_recent.first_MB.shape[0]:
         since = length - burn_in  # not negative: suite.config sees to it
         recent = Recent(
@@ -186,5 +188,5 @@ def rollout(
             hidden_BH=memory_TBH[since],
             acting_MB=None if trajectory.acting_TB is None else trajectory.acting_TB[since:],
         )
-        player = player.replace(recent=recent)
+        player = dataclasses.replace(player, recent=recent)
     return player, trajectory, log

@@ -54,4 +54,4 @@ class Batched:
             return jax.tree.map(lambda old, new: old.at[index].set(new), carry, (fresh_state, fresh_shown))
 
         state, shown = jax.lax.fori_loop(0, ended_B.sum(), reset_one, (state, shown))
-        return state, stepped.replace(first=ended_B, **shown)
+        return state, dataclasses.replace(stepped, first=ended_B, **shown)

@@ -104,8 +104,13 @@ class Environment(Protocol):
 class BatchedEnvironment(Protocol):
     """B environments side by side: the real ones behind `batching.Batched`, or the dream of a world model."""
 
-    spec: EnvironmentSpec
-    num_envs: int
+    @property
+    def spec(self) -> EnvironmentSpec:
+        """What the task is."""
+
+    @property
+    def num_envs(self) -> int:
+        """B."""
 
     def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
         """First time steps of B episodes; every array leads with B."""

@@ -40,16 +40,22 @@ class Tokenizer(Protocol):
     `...` stands for any leading axes (batch, time); O for an observation's own axes (uint8).
     """
 
-    tokens_per_frame: int
-    num_codes: int
-    metrics: tuple[str, ...]  # names of the scalars that `update` returns
+    @property
+    def tokens_per_frame(self) -> int:
+        """L."""
+
+    @property
+    def num_codes(self) -> int:
+        """K."""
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """Names of the scalars that `update` returns."""
 
     def init(self, key: jax.Array) -> TokenizerState:
         """A fresh state."""
 
-    def update(
-        self, state: TokenizerState, observation_NO: jax.Array
-    ) -> tuple[TokenizerState, dict[str, jax.Array]]:
+    def update(self, state: TokenizerState, observation_NO: jax.Array) -> tuple[TokenizerState, dict[str, jax.Array]]:
         """Learns from one batch of N observations; returns the new state and scalar metrics."""
 
     def encode(self, state: TokenizerState, observation: jax.Array) -> jax.Array:
@@ -59,4 +65,4 @@ class Tokenizer(Protocol):
         """uint8 observations [..., O] of tokens [..., L]."""
 
     def valid_codes(self, state: TokenizerState) -> jax.Array:
-        """bool [K]: codes that have a meaning; the others must never be sampled."""
+        """Bool [K]: codes that have a meaning; the others must never be sampled."""

@@ -34,9 +34,7 @@ def dense(inputs: int, outputs: int, gain: float, dtype: Any, rngs: nnx.Rngs) ->
 @jax.custom_vjp
 def convolve(x_NHWC: jax.Array, kernel: jax.Array) -> jax.Array:
     """Convolution of images with a kernel [3, 3, inputs, outputs], stride 1, SAME padding."""
-    return jax.lax.conv_general_dilated(
-        x_NHWC, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
+    return jax.lax.conv_general_dilated(x_NHWC, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
 
 
 def _convolve_forward(x_NHWC: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
@@ -180,7 +178,7 @@ class ImpalaCNN(nnx.Module):
 
     def __init__(self, shape: tuple[int, ...], config: PolicyConfig, dtype: Any, rngs: nnx.Rngs):
         height, width, channels = shape
-        self.stacks = nnx.List()
+        self.stacks: Any = nnx.List()
         for outputs in config.cnn_channels:
             self.stacks.append(ImpalaStack(channels, outputs, config, dtype, rngs))
             height, width, channels = (height + 1) // 2, (width + 1) // 2, outputs
@@ -217,9 +215,7 @@ class GRU(nnx.Module):
     def __init__(self, features: int, dtype: Any, rngs: nnx.Rngs):
         init = _per_gate(nnx.initializers.orthogonal())
         self.input_gates = nnx.Linear(features, 3 * features, kernel_init=init, dtype=dtype, rngs=rngs)
-        self.hidden_gates = nnx.Linear(
-            features, 3 * features, use_bias=False, kernel_init=init, dtype=dtype, rngs=rngs
-        )
+        self.hidden_gates = nnx.Linear(features, 3 * features, use_bias=False, kernel_init=init, dtype=dtype, rngs=rngs)
         self.candidate_bias = nnx.Param(jnp.zeros((features,), jnp.float32))
 
     def __call__(

@@ -6,6 +6,8 @@ Shapes: T steps, B environments, A actions, H memory units. In two-player games 
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -123,7 +125,8 @@ class TargetStatistics:
         """Takes in the mean and standard deviation of `targets` where `mask`; a mask of nothing changes nothing."""
         mean, std, count = _moments(targets, mask)
         keep = jnp.where(count > 0, decay, 1.0)
-        return self.replace(
+        return dataclasses.replace(
+            self,
             mean=keep * self.mean + (1.0 - keep) * mean,
             std=keep * self.std + (1.0 - keep) * std,
             weight=keep * self.weight + (1.0 - keep),
@@ -162,7 +165,7 @@ class Learner:
     @property
     def acting(self) -> Learner:
         """What acting needs: without the optimizer, so that training and evaluation share one compiled program."""
-        return self.replace(optimizer=None)
+        return dataclasses.replace(self, optimizer=None)
 
 
 def make_optimizer(ppo: PPOConfig, total_updates: int | None) -> optax.GradientTransformation:
@@ -208,7 +211,7 @@ def update(
     def minibatch_update(learner: Learner, index: jax.Array):
         part, hidden_BH = _environments(batch, trajectory.hidden_BH, index * size, size)
         targets = learner.targets.update(part.target_TB, part.acting_TB, ppo.target_decay)
-        part = part.replace(target_TB=targets.standardize(part.target_TB))
+        part = dataclasses.replace(part, target_TB=targets.standardize(part.target_TB))
 
         def loss_of(params: nnx.State):
             policy = nnx.merge(graphdef, params)

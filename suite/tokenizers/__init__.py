@@ -6,6 +6,7 @@ from suite.config import TokenizerConfig
 from suite.errors import UserError
 from suite.interface.environment import ObservationSpec
 from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
+from suite.tokenizers.patches import patch_grid
 
 
 def make_tokenizer(config: TokenizerConfig, observation: ObservationSpec) -> NearestNeighborTokenizer:
@@ -17,9 +18,8 @@ def make_tokenizer(config: TokenizerConfig, observation: ObservationSpec) -> Nea
     patch = config.patch or observation.patch
     if patch is None:
         raise UserError(f"tokenizer.kind={config.kind} needs frames of patches, not {observation.kind}")
-    tokenizer = NearestNeighborTokenizer(config.codebook_size, config.threshold, patch, observation)
     try:
-        tokenizer.grid
+        patch_grid(observation.shape, patch)
     except ValueError as error:
         raise UserError(f"tokenizer.patch={patch}: {error}") from error
-    return tokenizer
+    return NearestNeighborTokenizer(config.codebook_size, config.threshold, patch, observation)

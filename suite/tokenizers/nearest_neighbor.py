@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -56,8 +55,6 @@ class NearestNeighborTokenizer:
     def metrics(self) -> tuple[str, ...]:
         """What `update` reports."""
         return ("codes", "new_codes", "mean_distance", "max_distance")
-
-    metrics: ClassVar[tuple[str, ...]] = ("codes", "new_codes", "mean_distance", "max_distance")
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -129,7 +126,7 @@ class NearestNeighborTokenizer:
         return join_patches(state.codes_KP[tokens], self.observation.shape, self.patch)
 
     def valid_codes(self, state: NearestNeighborState) -> jax.Array:
-        """bool [K]: the codes that are filled."""
+        """Bool [K]: the codes that are filled."""
         return jnp.arange(self.codebook_size) < state.count
 
     def _nearest(self, state: NearestNeighborState, patches_MP: jax.Array) -> tuple[jax.Array, jax.Array]:

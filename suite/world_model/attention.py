@@ -30,7 +30,7 @@ def block_causal_attention(
     """Attention of every token to its whole own block and all earlier ones (Section 3.6, fidelity note 18).
 
     Another kernel replaces this one function. Here the queries are cut into `groups` runs of whole blocks, each of
-    which sees a static prefix of the keys, so that about half of what the mask forbids and more is never computed.
+    which sees a static prefix of the keys: with a run for each block nothing that the mask forbids is computed.
     The backward pass recomputes the weights: S * S of them are not kept.
 
     Args:
@@ -54,13 +54,14 @@ def block_causal_attention(
     return jnp.concatenate(outputs, axis=1)
 
 
-def cached_attention(
-    query_BQNH: jax.Array, key_BSNH: jax.Array, value_BSNH: jax.Array, filled: jax.Array
-) -> jax.Array:
-    """Attention of one block's queries to the first `filled` (int32 scalar) of the cached keys and values."""
-    visible_QS = jnp.broadcast_to(jnp.arange(key_BSNH.shape[1]) < filled, (query_BQNH.shape[1], key_BSNH.shape[1]))
-    mixed_BQNH, _ = _attend(query_BQNH, key_BSNH, value_BSNH, visible_QS)
-    return mixed_BQNH
+def cached_attention(query_BQNH: jax.Array, key_BNSH: jax.Array, value_BNSH: jax.Array, filled: jax.Array) -> jax.Array:
+    """Attention of one block's queries to the first `filled` (int32 scalar) of the cached keys and values.
+
+    These lead with the heads, as the products read them: nothing of the cache's size is moved.
+    """
+    visible_QS = jnp.broadcast_to(jnp.arange(key_BNSH.shape[2]) < filled, (query_BQNH.shape[1], key_BNSH.shape[2]))
+    mixed_BNQH, _ = _attend(query_BQNH.swapaxes(1, 2), key_BNSH, value_BNSH, visible_QS)
+    return mixed_BNQH.swapaxes(1, 2)
 
 
 # Differentiated by hand, for the gradient needs neither the softmax's reductions nor anything of S * S once more:
@@ -72,18 +73,19 @@ def _attend_run(query, key, value, dropout_key, first: int, block: int, rate: fl
 
 
 def _run_forward(query, key, value, dropout_key, first: int, block: int, rate: float):
+    # Heads before tokens: on a CPU the products are several times faster so.
+    query_BNQH, key_BNSH, value_BNSH = (x.swapaxes(1, 2) for x in (query, key, value))
     visible_QS = _visible(query.shape[1], key.shape[1], first, block)
-    mixed, log_total = _attend(query, key, value, visible_QS, rate, dropout_key)
-    return mixed, (query, key, value, dropout_key, mixed, log_total)
+    mixed_BNQH, log_total_BNQ1 = _attend(query_BNQH, key_BNSH, value_BNSH, visible_QS, rate, dropout_key)
+    saved = query_BNQH, key_BNSH, value_BNSH, dropout_key, mixed_BNQH, log_total_BNQ1
+    return mixed_BNQH.swapaxes(1, 2), saved
 
 
 def _run_backward(first: int, block: int, rate: float, saved, grad):
-    query, key, value, dropout_key, mixed, log_total_BNQ1 = saved
-    query_BNQH, key_BNSH, value_BNSH, mixed_BNQH, grad_BNQH = (
-        x.swapaxes(1, 2) for x in (query, key, value, mixed, grad)
-    )
-    scale, dtype = 1 / math.sqrt(query.shape[-1]), value.dtype
-    score_BNQS = _scores(query_BNQH * scale, key_BNSH, _visible(query.shape[1], key.shape[1], first, block))
+    query_BNQH, key_BNSH, value_BNSH, dropout_key, mixed_BNQH, log_total_BNQ1 = saved
+    grad_BNQH, dtype = grad.swapaxes(1, 2), grad.dtype
+    scale = 1 / math.sqrt(query_BNQH.shape[-1])
+    score_BNQS = _scores(query_BNQH * scale, key_BNSH, _visible(query_BNQH.shape[2], key_BNSH.shape[2], first, block))
     weight_BNQS = jnp.exp(score_BNQS - log_total_BNQ1)
     dropped_BNQS = dropout(weight_BNQS, rate, dropout_key).astype(dtype)
     grad_value_BNHS = _product("bnqh,bnqs->bnhs", grad_BNQH, dropped_BNQS)  # of this shape: a CPU's fast path
@@ -99,19 +101,19 @@ def _run_backward(first: int, block: int, rate: float, saved, grad):
 _attend_run.defvjp(_run_forward, _run_backward)
 
 
-def _attend(query, key, value, visible_QS, rate: float = 0.0, dropout_key=None) -> tuple[jax.Array, jax.Array]:
-    """The mixed values [B, Q, N, H], and the logarithm of the softmax's denominator [B, N, Q, 1]."""
-    # Heads before tokens: on a CPU the products are several times faster so. The weights are divided by their sum
-    # after the product with the values, which is one pass fewer over the largest array.
-    query_BNQH, key_BNSH, value_BNSH = (x.swapaxes(1, 2) for x in (query / math.sqrt(query.shape[-1]), key, value))
-    score_BNQS = _scores(query_BNQH, key_BNSH, visible_QS)
+def _attend(
+    query_BNQH, key_BNSH, value_BNSH, visible_QS, rate: float = 0.0, dropout_key=None
+) -> tuple[jax.Array, jax.Array]:
+    """The mixed values [B, N, Q, H], and the logarithm of the softmax's denominator [B, N, Q, 1]."""
+    # The weights are divided by their sum after the product with the values, one pass fewer over the largest array.
+    dtype = value_BNSH.dtype
+    score_BNQS = _scores(query_BNQH / math.sqrt(query_BNQH.shape[-1]), key_BNSH, visible_QS)
     largest_BNQ1 = score_BNQS.max(-1, keepdims=True)
     weight_BNQS = jnp.exp(score_BNQS - largest_BNQ1)
     # A product: on a CPU, row sums are several times slower.
     total_BNQ1 = jnp.dot(weight_BNQS, jnp.ones((weight_BNQS.shape[-1], 1)))
-    mixed_BNQH = _product("bnqs,bnsh->bnqh", dropout(weight_BNQS, rate, dropout_key).astype(value.dtype), value_BNSH)
-    mixed_BQNH = (mixed_BNQH / total_BNQ1).astype(value.dtype).swapaxes(1, 2)
-    return mixed_BQNH, largest_BNQ1 + jnp.log(total_BNQ1)
+    mixed_BNQH = _product("bnqs,bnsh->bnqh", dropout(weight_BNQS, rate, dropout_key).astype(dtype), value_BNSH)
+    return (mixed_BNQH / total_BNQ1).astype(dtype), largest_BNQ1 + jnp.log(total_BNQ1)
 
 
 def _scores(query_BNQH: jax.Array, key_BNSH: jax.Array, visible_QS: jax.Array | None) -> jax.Array:
@@ -120,7 +122,7 @@ def _scores(query_BNQH: jax.Array, key_BNSH: jax.Array, visible_QS: jax.Array | 
 
 
 def _visible(queries: int, keys: int, first: int, block: int) -> jax.Array | None:
-    """bool [Q, S]: which keys each query of a run sees; None: all of them."""
+    """Bool [Q, S]: which keys each query of a run sees; None: all of them."""
     if queries == block:
         return None
     return ((first + jnp.arange(queries)) // block)[:, None] >= (jnp.arange(keys) // block)[None, :]

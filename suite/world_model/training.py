@@ -13,6 +13,7 @@ from suite.config import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.world_model.transformer import WorldModel
 
+CHUNK_LOGITS = 2**25  # observation logits held at once: 128 MiB
 METRICS: tuple[str, ...] = (
     "loss",
     "observation_loss",
@@ -22,17 +23,6 @@ METRICS: tuple[str, ...] = (
     "reward_accuracy",
     "termination_loss",
     "gradient_norm",
-)
-CHUNK_LOGITS = 2**25  # observation logits held at once: 128 MiB
-METRICS = (
-    "loss",
-    "observation_loss",
-    "reward_loss",
-    "termination_loss",
-    "token_accuracy",
-    "changed_token_accuracy",
-    "reward_accuracy",
-    "grad_norm",
 )  # names of what `update` returns
 
 
@@ -137,7 +127,7 @@ def cross_entropy(logits: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.
 def _token_losses(model: WorldModel, hidden_BTSD: jax.Array, target_BTL: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Observation cross-entropy [B, T, L] and correctness, a few sequences at a time.
 
-    The logits of a chunk are dropped and computed again for the backward pass, so that B * T * L * K of them never exist.
+    The logits of a chunk are dropped and computed again for the backward pass, so that never are there B * T * L * K.
     """
 
     @jax.checkpoint
@@ -146,7 +136,9 @@ def _token_losses(model: WorldModel, hidden_BTSD: jax.Array, target_BTL: jax.Arr
 
     batch = target_BTL.shape[0]
     logits = target_BTL[0].size * model.observation_head.bias.shape[0]
-    chunk = max(size for size in range(1, batch + 1) if batch % size == 0 and size * logits <= max(CHUNK_LOGITS, logits))
+    chunk = max(
+        size for size in range(1, batch + 1) if batch % size == 0 and size * logits <= max(CHUNK_LOGITS, logits)
+    )
     split = (hidden_BTSD, target_BTL)
     chunked = jax.tree.map(lambda x: x.reshape(batch // chunk, chunk, *x.shape[1:]), split)
     loss, correct = jax.lax.map(lambda pair: chunk_losses(*pair), chunked)

@@ -112,7 +112,9 @@ def test_burn_in_with_unchanged_parameters_changes_nothing_and_follows_new_ones(
 def test_burn_in_from_zero_sees_only_the_recent_frames():
     policy, player, trajectory, _ = roll(Corridor(limit=100))
     forgotten = play.refresh(policy, player, carried=False)
-    expected = policy.advance(trajectory.observation_TB[-M:], trajectory.first_TB[-M:], jnp.zeros_like(player.hidden_BH))
+    expected = policy.advance(
+        trajectory.observation_TB[-M:], trajectory.first_TB[-M:], jnp.zeros_like(player.hidden_BH)
+    )
     chex.assert_trees_all_close(forgotten.hidden_BH, expected, atol=1e-5)
     no_end_B = ~trajectory.first_TB[-M:].any(0)
     assert bool(no_end_B.any())

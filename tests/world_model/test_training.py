@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+
+from suite.world_model.training import METRICS, WorldModelLearner, cross_entropy, losses, make_optimizer, update
+from tests.world_model.small import SPEC, random_sequences, small_config, small_model
+
+SEQUENCES = random_sequences()
+
+
+def reference(model, sequences, step_weight, token_weight, reward_weight: float) -> dict[str, float]:
+    """The losses in NumPy float64, from the model's logits."""
+    tokens = np.asarray(sequences.tokens_BTL)
+    hidden = model(sequences.tokens_BTL[:, :-1], sequences.action_BT)
+
+    def nats(logits, target):
+        logits = np.asarray(logits, np.float64)
+        return np.log(np.exp(logits).sum(-1)) - np.take_along_axis(logits, target[..., None], -1)[..., 0]
+
+    def mean(value, weight):
+        return (value * weight).sum() / weight.sum()
+
+    logits = model.observation_logits(hidden)
+    token_weight = np.broadcast_to(token_weight[..., None], tokens[:, 1:].shape)
+    correct = np.asarray(logits).argmax(-1) == tokens[:, 1:]
+    reward = (np.asarray(sequences.reward_BT) >= 0.5).astype(int)
+    result = {
+        "observation_loss": mean(nats(logits, tokens[:, 1:]), token_weight),
+        "reward_loss": mean(nats(model.reward_logits(hidden), reward), step_weight),
+        "termination_loss": mean(
+            nats(model.termination_logits(hidden), np.asarray(sequences.terminated_BT, int)), step_weight
+        ),
+        "token_accuracy": mean(correct, token_weight),
+        "changed_token_accuracy": mean(correct, token_weight * (tokens[:, 1:] != tokens[:, :-1])),
+        "reward_accuracy": mean(np.asarray(model.reward_logits(hidden)).argmax(-1) == reward, step_weight),
+    }
+    other = result["reward_loss"] + result["termination_loss"]
+    return result | {"loss": result["observation_loss"] + reward_weight * other}
+
+
+@pytest.mark.parametrize("reward_weight", [1.0, 10.0])
+def test_losses_against_numpy(reward_weight):
+    model, config = small_model(std=0.2), small_config(reward_weight=reward_weight)
+    value, metrics = losses(model, SEQUENCES, config, SPEC)
+    ones = np.ones(SEQUENCES.reward_BT.shape)
+    expected = reference(model, SEQUENCES, ones, ones, reward_weight)
+    for name, number in (metrics | {"loss": value}).items():
+        np.testing.assert_allclose(number, expected[name], rtol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("truncated", [False, True])
+def test_mask_after_done(truncated):
+    """Sequence 0 ends at its step 1: the step counts, the frame it leads to and all that follows do not."""
+    ended = jnp.zeros((3, 5), bool).at[0, 1].set(True)
+    sequences = SEQUENCES.replace(
+        terminated_BT=jnp.zeros_like(ended) if truncated else ended, ended_BT=ended if truncated else None
+    )
+    step_weight, token_weight = np.ones((3, 5)), np.ones((3, 5))
+    step_weight[0, 2:] = token_weight[0, 1:] = 0
+    model, config = small_model(std=0.2), small_config(mask_after_done=True)
+    value, metrics = losses(model, sequences, config, SPEC)
+    expected = reference(model, sequences, step_weight, token_weight, 1.0)
+    for name, number in (metrics | {"loss": value}).items():
+        np.testing.assert_allclose(number, expected[name], rtol=1e-5, err_msg=name)
+    unmasked, _ = losses(model, sequences, small_config(), SPEC)
+    assert not np.allclose(unmasked, value)
+
+
+def test_chunked_logits_change_neither_losses_nor_gradients(monkeypatch):
+    config, sequences = small_config(), random_sequences(batch=6)
+    graph, params = nnx.split(small_model(std=0.2))
+
+    def loss_and_gradient():
+        return jax.value_and_grad(lambda p: losses(nnx.merge(graph, p), sequences, config, SPEC)[0])(params)
+
+    value, gradient = loss_and_gradient()
+    monkeypatch.setattr("suite.world_model.training.CHUNK_LOGITS", 2 * 5 * 6 * 8)  # two of six sequences at once
+    chunked_value, chunked_gradient = loss_and_gradient()
+    np.testing.assert_allclose(chunked_value, value, rtol=1e-6)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), chunked_gradient, gradient)
+
+
+def test_cross_entropy_is_uniform_for_equal_logits():
+    loss, _ = cross_entropy(jnp.zeros((2, 8)), jnp.asarray([0, 7]))
+    np.testing.assert_allclose(loss, np.log(8), rtol=1e-6)
+
+
+def test_an_update_is_clipped_adam_and_returns_the_named_metrics():
+    config = small_config(max_grad_norm=1e-3, dropout=0.0)
+    graph, params = nnx.split(small_model(std=0.2, dropout=0.0))
+    optimizer = make_optimizer(config)
+    learner = WorldModelLearner(params, optimizer.init(params))
+    step = jax.jit(functools.partial(update, config, optimizer, graph, SPEC))
+    after, metrics = step(learner, SEQUENCES, jax.random.key(0))
+    assert set(metrics) == set(METRICS) and len(METRICS) == len(set(METRICS))
+    assert all(value.shape == () for value in metrics.values())
+
+    gradient = jax.grad(lambda p: losses(nnx.merge(graph, p), SEQUENCES, config, SPEC)[0])(params)
+    norm = optax.tree.norm(gradient)
+    np.testing.assert_allclose(metrics["gradient_norm"], norm, rtol=1e-4)
+
+    def expected(old, slope):  # Adam's first step: its moments are the clipped gradient and its square
+        clipped = slope * (1e-3 / norm)
+        return old - config.learning_rate * clipped / (jnp.abs(clipped) + config.adam_eps)
+
+    jax.tree.map(
+        lambda new, old, slope: np.testing.assert_allclose(new, expected(old, slope), atol=2e-6),
+        after.params,
+        params,
+        gradient,
+    )
+
+
+def test_dropout_follows_the_key():
+    config = small_config(dropout=0.3)
+    model = small_model(std=0.2, dropout=0.3)
+    values = [losses(model, SEQUENCES, config, SPEC, key)[0] for key in (None, jax.random.key(0), jax.random.key(1))]
+    assert len({float(value) for value in values}) == 3
