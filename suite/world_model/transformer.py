@@ -125,7 +125,7 @@ class WorldModel(nnx.Module):
             return layer.add(x, attended, residual_key), None
 
         indices = jnp.arange(self.config.layers)
-        # Unrolled: copying what the backward pass needs in and out of a loop's stacks costs a seventh of the update (2 layers, CPU).
+        # Unrolled: on a CPU, moving what the backward pass needs in and out of a loop costs a seventh of the update.
         x, _ = jax.lax.scan(run_layer, dropout(x, rate, embedding_key), (layers, indices), unroll=True)
         return self.norm(x).reshape(batch, steps, self.block, -1)
 
