@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -99,9 +100,7 @@ def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str
     """
     with RunRecord.open(folder) as record:
         config = record.config
-        entry = registry.task(config.task)
-        enable_compilation_cache()
-        agent = Agent(config, entry.make()(progress=reporter.texture))
+        agent = agent_for(config, reporter)
         template = jax.eval_shape(agent.init, jax.random.key(0))
         restored = checkpoint.restore_latest(folder / "checkpoints", model_template(template))
         if restored is None:
@@ -113,11 +112,25 @@ def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str
         return record_evaluation(record, agent, learner, restored.step, count)
 
 
+_agents: dict[Config, Agent] = {}  # the last one built
+
+
+def agent_for(config: Config, reporter: Reporter) -> Agent:
+    """The agent of a configuration. Configurations that differ by seed share one, and its compiled programs."""
+    unseeded = dataclasses.replace(config, seed=0)
+    if unseeded not in _agents:
+        _agents.clear()
+        enable_compilation_cache()
+        environment = registry.task(config.task).make()(progress=reporter.texture)
+        _agents[unseeded] = Agent(unseeded, environment)
+    return _agents[unseeded]
+
+
 def record_evaluation(record: RunRecord, agent: Agent, learner: Learner, step: int, episodes: int) -> dict[str, Any]:
     """Plays whole episodes with the policy of `step`, records them, and returns their scores."""
-    rows = play_episodes(agent, learner, evaluation_key(agent.config), episodes)
+    rows = play_episodes(agent, learner, evaluation_key(record.config), episodes)
     record.append_evaluation({**row, "step": step} for row in rows)
-    scores = registry.task(agent.config.task).scores()(pd.DataFrame(rows), None, agent.spec)
+    scores = registry.task(record.config.task).scores()(pd.DataFrame(rows), None, agent.spec)
     return {"step": step, "episodes": len(rows), **scores}
 
 

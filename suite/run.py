@@ -16,10 +16,9 @@ import numpy as np
 
 from suite import checkpoint, registry
 from suite.agent.dyna import Agent, TrainState
-from suite.compilation import enable_compilation_cache
 from suite.config import Config
 from suite.errors import RunError, UserError
-from suite.evaluation import episode_rows, model_of, record_evaluation
+from suite.evaluation import agent_for, episode_rows, model_of, record_evaluation
 from suite.policy.ppo import Learner
 from suite.record import RunRecord, disk_full_is_an_error, run_folder
 from suite.reporting import Reporter
@@ -59,16 +58,14 @@ def run(config: Config, out: Path, reporter: Reporter, resume: bool = False) -> 
     with RunRecord.open_or_create(folder, config, entry.spec()) as record, disk_full_is_an_error():
         if record.finished:
             return _result(record, "already finished")
-        enable_compilation_cache()
-        agent = Agent(config, entry.make()(progress=reporter.texture))
-        return _Training(agent, record, reporter).run()
+        return _Training(config, agent_for(config, reporter), record, reporter).run()
 
 
 class _Training:
     """The host's side of a run: phases in order, their metrics and timing, checkpoints, signals."""
 
-    def __init__(self, agent: Agent, record: RunRecord, reporter: Reporter):
-        self.agent, self.config, self.record, self.reporter = agent, agent.config, record, reporter
+    def __init__(self, config: Config, agent: Agent, record: RunRecord, reporter: Reporter):
+        self.config, self.agent, self.record, self.reporter = config, agent, record, reporter
         self.checkpoints = record.folder / "checkpoints"
         self.key = jax.random.key(self.config.seed)
         self.iteration = 0

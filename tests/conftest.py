@@ -21,3 +21,10 @@ def compilation_cache():
     from suite.compilation import enable_compilation_cache
 
     enable_compilation_cache()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def drop_compiled_programs():
+    """Hundreds of compiled programs in one process exhaust it."""
+    yield
+    jax.clear_caches()

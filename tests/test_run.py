@@ -13,10 +13,9 @@ import pandas as pd
 import pytest
 
 from suite import checkpoint, evaluation, registry, run
-from suite.agent.dyna import Agent
 from suite.errors import RunError, UserError
 from suite.reporting import QuietReporter
-from tests.tiny import CORRIDOR, Corridor
+from tests.tiny import CORRIDOR
 
 
 @pytest.fixture(autouse=True)
@@ -63,7 +62,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def last_model(folder: Path, settings):
-    agent = Agent(settings, Corridor())
+    agent = evaluation.agent_for(settings, QuietReporter())
     template = evaluation.model_template(jax.eval_shape(agent.init, jax.random.key(0)))
     restored = checkpoint.restore_latest(folder / "checkpoints", template)
     return [np.asarray(x) for x in jax.tree.leaves(restored.model)]
