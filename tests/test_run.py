@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -143,11 +144,12 @@ def test_records_are_complete(uninterrupted):
     assert not (uninterrupted.folder / "checkpoints" / "step_000000000192" / "resume").exists()
 
 
-def test_the_first_episodes_of_an_evaluation_are_whole(uninterrupted):
-    scores = evaluation.evaluate(uninterrupted.folder, 10, QuietReporter())
+def test_the_first_episodes_of_an_evaluation_are_whole(tmp_path, uninterrupted):
+    folder = shutil.copytree(uninterrupted.folder, tmp_path / "copy")
+    scores = evaluation.evaluate(folder, 10, QuietReporter())
     assert scores["step"] == 192
     assert scores["episodes"] == 12  # three rounds of four environments
-    rows = pd.read_csv(uninterrupted.folder / "evaluations.csv")
+    rows = pd.read_csv(folder / "evaluations.csv")
     assert len(rows) == 4 + 12  # the run's own, and these
 
 
