@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 import types
 
 import jax
@@ -225,3 +227,31 @@ def test_a_kill_while_dropping_leaves_a_whole_checkpoint(saved, tmp_path, monkey
 def test_a_checkpoint_of_another_network(saved, change):
     with pytest.raises(UserError, match="does not fit this version or configuration"):
         checkpoint.restore_latest(saved, model() | change)
+
+
+REFUSED_WRITE = """
+import resource, sys
+from pathlib import Path
+import jax.numpy as jnp, numpy as np
+from suite import checkpoint
+
+folder, small = Path(sys.argv[1]), {"x": jnp.ones(3)}
+noise = np.random.default_rng(0).integers(0, 256, 300_000, dtype=np.uint8)  # so that it cannot be compressed
+checkpoint.save(folder, 1, small, small, {})
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    checkpoint.save(folder, 2, small, {"x": jnp.asarray(noise)}, {})
+except Exception as error:
+    print(error)
+print(checkpoint.restore_latest(folder, small).step)
+"""
+
+
+def test_a_write_that_the_system_refuses_is_one_error_and_no_log(tmp_path):
+    ran = subprocess.run(
+        [sys.executable, "-c", REFUSED_WRITE, str(tmp_path)], capture_output=True, text=True, timeout=120
+    )
+    assert ran.stderr == ""
+    *error, step = ran.stdout.splitlines()
+    assert "File too large" in " ".join(error)
+    assert step == "1" and [path.name for path in tmp_path.iterdir()] == ["step_000000000001"]
