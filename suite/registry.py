@@ -100,7 +100,7 @@ TASKS = (
             "smoke": Lazy("baselines.presets:craftax_classic_smoke"),
         },
         own_auto_reset=Lazy("adapters.craftax:BuiltInAutoReset"),
-        cost="small on two CPU cores: m5 6 min, mfrl 1.5 min, random 15 s, 1 min more to compile first, 2.3 GiB; paper: an accelerator",
+        cost="small on two CPU cores: m5 6 min, mfrl 2 min, random 15 s, 2.3 GiB; paper: an accelerator",
     ),
 )
 
