@@ -1,0 +1,30 @@
+"""The benchmark measures every phase, and its projection adds up. No speed is asserted."""
+
+from __future__ import annotations
+
+import pytest
+
+from suite import bench, races, registry
+from suite.reporting import QuietReporter
+from tests.tiny import CORRIDOR
+
+
+def test_every_phase_is_measured_and_projected(monkeypatch):
+    monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR))
+    monkeypatch.setattr(races, "RACE_ENVS", 4)
+    monkeypatch.setattr(races, "RACE_STEPS", 8)
+    config = registry.resolve("corridor", "m5", "smoke")
+    report = bench.bench(config, QuietReporter(), start_up=False)
+    phases = {row["phase"]: row for row in report["phases of one iteration"]}
+    assert list(phases) == ["collect", "remember", "learn", "tokenizer", "world_model", "imagine"]
+    assert sum(row["share %"] for row in phases.values()) == pytest.approx(100)
+    assert all(phases[name]["GFLOP/s"] > 0 for name in ("collect", "learn", "world_model", "imagine"))
+    # Six iterations of everything; two imagined updates in each of the last four.
+    ms = {name: row["ms"] for name, row in phases.items()}
+    seconds = (6 * (sum(ms.values()) - ms["imagine"]) + 4 * ms["imagine"]) / 1e3
+    assert report["projected hours of the whole run"] == pytest.approx(seconds / 3600)
+    assert [row["environment"] for row in report["environment steps/s, random actions"]] == [
+        "no reset",
+        "exact auto-reset",
+    ]
+    assert report["one imagined step"][0]["times faster"] > 0
