@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from adapters.craftax import _craftax_numerics
-from adapters.craftax_renderer import make_renderer
+from adapters.craftax_renderer import make_renderer, uniform
 
 FRAMES = 512
 ROUNDING = 1e-4  # of 255: the last bits of float32
@@ -112,3 +112,12 @@ def test_play_at_all_hours(play, renderers):
     assert (np.asarray(observation) != np.round(original).astype(np.uint8))[drawn].mean() < 1e-5
     assert (states.light_level < 0.2).any() and (states.light_level > 0.95).any()
     assert states.is_sleeping.any() and (states.zombies.mask | states.cows.mask).any()
+
+
+@pytest.mark.parametrize("shape", [(49, 63), (7,), (1, 3)])
+def test_the_nights_noise_is_the_number_stream_of_jax(shape):
+    for seed in range(20):
+        key = jax.random.key(seed)
+        expected = jax.random.uniform(key, shape)
+        np.testing.assert_array_equal(uniform(key, shape), expected)
+        np.testing.assert_array_equal(uniform(jax.random.key_data(key), shape), expected)
