@@ -57,15 +57,16 @@ def _convolve_backward(saved: tuple[jax.Array, jax.Array], slope_NHWC: jax.Array
 
 
 def _kernel_gradient_by_products(x_NHWC: jax.Array, slope_NHWC: jax.Array) -> jax.Array:
-    _, height, width, inputs = x_NHWC.shape
+    inputs = x_NHWC.shape[-1]
     padded = jnp.pad(x_NHWC, ((0, 0), (1, 1), (1, 1), (0, 0)))
     slope_MO = slope_NHWC.reshape(-1, slope_NHWC.shape[-1])
-    products = [
-        padded[:, row : row + height, column : column + width].reshape(-1, inputs).T @ slope_MO
-        for row in range(3)
-        for column in range(3)
-    ]
-    return jnp.stack(products).reshape(3, 3, inputs, -1)
+
+    def product(offset: jax.Array) -> jax.Array:
+        corner = (0, offset // 3, offset % 3, 0)
+        return jax.lax.dynamic_slice(padded, corner, x_NHWC.shape).reshape(-1, inputs).T @ slope_MO
+
+    # A loop, because nine products side by side would hold nine copies of the images, of every layer, at once.
+    return jax.lax.map(product, jnp.arange(9)).reshape(3, 3, inputs, -1)
 
 
 def _kernel_gradient_by_convolution(x_NHWC: jax.Array, slope_NHWC: jax.Array) -> jax.Array:
