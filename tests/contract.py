@@ -85,8 +85,9 @@ def check_spec(environment: Environment) -> None:
 def check_types(environment: Environment, num_envs: int) -> None:
     """Shapes and dtypes, alone and batched; a step returns the types it was given, or would be compiled again."""
     spec, key = environment.spec, jax.random.key(0)
+    alone = environment.reset if not spec.two_player else lambda key: environment.reset(key, jnp.int32(2))
     for lead, reset, step in (
-        ((), environment.reset, environment.step),
+        ((), alone, environment.step),
         ((num_envs,), Batched(environment, num_envs).reset, Batched(environment, num_envs).step),
     ):
         action = jax.ShapeDtypeStruct(lead, jnp.int32)
@@ -109,6 +110,8 @@ def check_types(environment: Environment, num_envs: int) -> None:
         assert spec.two_player == (first.turn is not None)
         if first.turn is not None:
             assert first.turn.legal_A.shape == (*lead, spec.num_actions)
+            assert first.turn.chance_C.shape == (*lead, spec.chance_outcomes)
+            assert first.turn.opponent_observation.shape == (*lead, *spec.observation.shape)
 
 
 def check_ranges(environment: Environment, play: Play) -> None:
@@ -126,6 +129,10 @@ def check_ranges(environment: Environment, play: Play) -> None:
         assert np.isin(turn.player, (0, 1, 2)).all() and np.isin(turn.seat, (1, 2)).all()
         assert (turn.legal_A.any(-1) == ~at_chance).all(), "players have a legal action, chance has none"
         np.testing.assert_allclose(turn.chance_C.sum(-1), at_chance, atol=1e-5)
+        # An environment keeps its seat, and every other one sits in the other.
+        np.testing.assert_array_equal(
+            turn.seat, np.broadcast_to(1 + np.arange(turn.seat.shape[1]) % 2, turn.seat.shape)
+        )
 
 
 def check_rewards(environment: Environment, play: Play) -> None:
@@ -185,7 +192,8 @@ def _programs(environment: Environment, num_envs: int, steps: int):
         state, key, action_B = before
         step_keys_B, reset_keys_B = jax.random.split(key, (2, num_envs))
         stepped = jax.vmap(environment.step)(step_keys_B, state, action_B)
-        return None, (*stepped, *jax.vmap(environment.reset)(reset_keys_B))
+        seats_B = (1 + jnp.arange(num_envs) % 2,) if environment.spec.two_player else ()
+        return None, (*stepped, *jax.vmap(environment.reset)(reset_keys_B, *seats_B))
 
     return (
         jax.jit(batched.reset),

@@ -66,42 +66,47 @@ PENNIES_SPEC = EnvironmentSpec(
     num_actions=2,
     reward_classes=(-1.0, 0.0, 1.0),
     two_player=True,
+    chance_outcomes=3,
 )
 
 
 class Pennies:
-    """Chance deals a coin (outcome 0 or 2 of three), player 1 guesses, player 2 passes (one legal action), pays +-1.
+    """Chance deals a coin (outcome 0 or 2 of three), player 1 guesses, player 2 passes (one legal action).
 
-    Player 2's pass carries the reward, so that it must reach player 1's guess two events before. Our seat is 1.
+    The pass carries the reward, +-1 for player 1 and the opposite for player 2, so that it must reach player 1's
+    guess two events before.
     """
 
     spec = PENNIES_SPEC
 
-    def reset(self, key: jax.Array) -> tuple[jax.Array, TimeStep]:
-        state = jnp.zeros(3, jnp.int32)  # who is to act: 0 chance, 1 us, 2 them; the coin; our guess
+    def reset(self, key: jax.Array, seat: jax.Array) -> tuple[jax.Array, TimeStep]:
+        zero = jnp.int32(0)
+        state = jnp.stack([zero, zero, zero, seat])  # who is to act: 0 chance, 1, 2; the coin; the guess; our seat
         return state, self._show(state, jnp.float32(0), jnp.zeros((), bool), jnp.ones((), bool))
 
     def step(self, key: jax.Array, state: jax.Array, action: jax.Array) -> tuple[jax.Array, TimeStep]:
-        player, coin, guess = state
+        player, coin, guess, seat = state
         coin = jnp.where(player == 0, action // 2, coin)
         guess = jnp.where(player == 1, action, guess)
         done = player == 2
-        reward = jnp.where(done, jnp.where(coin == guess, 1.0, -1.0), 0.0).astype(jnp.float32)
-        state = jnp.stack([(player + 1) % 3, coin, guess])
-        return state, self._show(state, reward, done, jnp.zeros((), bool))
+        payment = jnp.where((coin == guess) == (seat == 1), jnp.float32(1), jnp.float32(-1))
+        state = jnp.stack([(player + 1) % 3, coin, guess, seat])
+        return state, self._show(state, jnp.where(done, payment, jnp.float32(0)), done, jnp.zeros((), bool))
 
     def _show(self, state, reward, terminated, first) -> TimeStep:
-        player, coin, _ = state
-        observation = jnp.stack([player, jnp.where(player == 1, 1 + coin, 0)]).astype(jnp.uint8)
+        player, coin, _, seat = state
+        of_1 = jnp.stack([player, jnp.where(player == 1, 1 + coin, 0)]).astype(jnp.uint8)
+        of_2 = jnp.stack([player, jnp.int32(0)]).astype(jnp.uint8)
+        ours, theirs = jnp.where(seat == 1, of_1, of_2), jnp.where(seat == 1, of_2, of_1)
         turn = Turn(
             player=player,
-            seat=jnp.int32(1),
+            seat=seat,
             legal_A=jnp.where(player == 0, False, jnp.array([True, True]) & ((player == 1) | jnp.array([True, False]))),
-            chance_C=jnp.where(player == 0, jnp.array([0.5, 0.0, 0.5]), 0.0),
-            opponent_observation=observation,
+            chance_C=jnp.where(player == 0, jnp.array([0.5, 0.0, 0.5], jnp.float32), jnp.float32(0)),
+            opponent_observation=theirs,
         )
         no = jnp.zeros((), bool)
-        return TimeStep(observation, reward, terminated, no, first, observation, {}, turn)
+        return TimeStep(ours, reward, terminated, no, first, ours, {}, turn)
 
 
 def make_corridor(progress=None) -> Corridor:

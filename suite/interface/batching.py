@@ -21,6 +21,8 @@ class Batched:
 
     Randomness, so that a manual reset can reproduce ours: `reset(key)` gives environment i the key
     `split(key, B)[i]`; `step(key, ...)` splits into `split(key, (2, B))`: row 0 steps, row 1 resets.
+
+    In a two-player game environment i keeps one seat for good: 1 where i is even, 2 where it is odd.
     """
 
     environment: Environment
@@ -32,7 +34,7 @@ class Batched:
 
     def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
         """B fresh episodes; every array leads with B."""
-        return jax.vmap(self.environment.reset)(jax.random.split(key, self.num_envs))
+        return jax.vmap(self._reset)(jax.random.split(key, self.num_envs), jnp.arange(self.num_envs))
 
     def step(self, key: jax.Array, state: State, action_B: jax.Array) -> tuple[State, TimeStep]:
         """One step of each environment; those that ended continue at the first frame of a new episode.
@@ -49,9 +51,14 @@ class Batched:
 
         def reset_one(i, carry):
             index = order_B[i]
-            fresh_state, fresh = self.environment.reset(reset_keys_B[index])
+            fresh_state, fresh = self._reset(reset_keys_B[index], index)
             fresh_shown = {"observation": fresh.observation, "turn": fresh.turn}
             return jax.tree.map(lambda old, new: old.at[index].set(new), carry, (fresh_state, fresh_shown))
 
         state, shown = jax.lax.fori_loop(0, ended_B.sum(), reset_one, (state, shown))
         return state, dataclasses.replace(stepped, first=ended_B, **shown)
+
+    def _reset(self, key: jax.Array, index: jax.Array) -> tuple[State, TimeStep]:
+        if not self.spec.two_player:
+            return self.environment.reset(key)
+        return self.environment.reset(key, (1 + index % 2).astype(jnp.int32))

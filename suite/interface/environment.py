@@ -50,7 +50,8 @@ class EnvironmentSpec:
       achievements: names of the achievements, in the order of `TimeStep.statistics["achievements"]`.
       statistics: names and shapes of the per-episode statistics that time steps carry.
       package: the package whose rules these are; its version is part of the protocol.
-      two_player: whether time steps carry a `Turn`.
+      two_player: whether time steps carry a `Turn`, and `reset` takes our seat.
+      chance_outcomes: C, how many outcomes chance has in a two-player game; 0: there is no chance.
     """
 
     id: str
@@ -62,6 +63,7 @@ class EnvironmentSpec:
     statistics: tuple[tuple[str, tuple[int, ...]], ...] = ()
     package: str = ""
     two_player: bool = False
+    chance_outcomes: int = 0
 
 
 @struct.dataclass
@@ -94,11 +96,14 @@ class Environment(Protocol):
 
     spec: EnvironmentSpec
 
-    def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
-        """A freshly generated episode and its first time step (`first` true, reward 0)."""
+    def reset(self, key: jax.Array, seat: jax.Array | None = None) -> tuple[State, TimeStep]:
+        """A freshly generated episode and its first time step (`first` true, reward 0).
+
+        `seat`: int32 scalar, which of a game's two players is ours (1 or 2); None for single-agent tasks, always.
+        """
 
     def step(self, key: jax.Array, state: State, action: jax.Array) -> tuple[State, TimeStep]:
-        """One step; never resets. `action`: int32 scalar in [0, A)."""
+        """One step; never resets. `action`: int32 scalar in [0, A); of a game, the event, as `choose_event` says."""
 
 
 class BatchedEnvironment(Protocol):

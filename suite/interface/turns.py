@@ -36,14 +36,24 @@ class Turn:
         return self.player == self.seat
 
 
+def stream_action(turn: Turn, event: jax.Array) -> jax.Array:
+    """The event in the vocabulary of a world model's stream, where no two players share an action (note 32).
+
+    [0, A) is player 1, [A, 2A) player 2, [2A, 2A + C) chance. int32, of the shape of `event`.
+    """
+    num_actions = turn.legal_A.shape[-1]
+    return event + num_actions * jnp.where(turn.player == CHANCE, 2, turn.player - 1)
+
+
 def choose_event(key: jax.Array, turn: Turn, action_B: jax.Array) -> jax.Array:
     """The event that happens at each environment's turn, int32 [B], in the player's own numbering.
 
     Ours: `action_B`. The opponent's: uniform over its legal actions. Chance's: an outcome index drawn from
-    `chance_C` (the paper's Section 4.7). The environment maps (player, event) to its stream's vocabulary.
+    `chance_C` (the paper's Section 4.7).
     """
     opponent_key, chance_key = jax.random.split(key)
-    opponent_B = jax.random.categorical(opponent_key, jnp.where(turn.legal_A, 0.0, -jnp.inf))
-    chance_B = jax.random.categorical(chance_key, jnp.log(turn.chance_C))
-    other_B = jnp.where(turn.player == CHANCE, chance_B, opponent_B)
+    other_B = jax.random.categorical(opponent_key, jnp.where(turn.legal_A, 0.0, -jnp.inf))
+    if turn.chance_C.shape[-1]:
+        chance_B = jax.random.categorical(chance_key, jnp.log(turn.chance_C))
+        other_B = jnp.where(turn.player == CHANCE, chance_B, other_B)
     return jnp.where(turn.ours, action_B, other_B).astype(jnp.int32)

@@ -20,6 +20,10 @@ def assert_equal(actual, expected):
     jax.tree.map(np.testing.assert_array_equal, actual, expected)
 
 
+def reset(environment, key, index):
+    return environment.reset(key, jnp.int32(1 + index % 2)) if environment.spec.two_player else environment.reset(key)
+
+
 def one_by_one(environment, key, states, action_B):
     """The documented meaning of `Batched.step`, without vmap or loops of JAX."""
     step_keys, reset_keys = jax.random.split(key, (2, BATCH))
@@ -27,7 +31,7 @@ def one_by_one(environment, key, states, action_B):
     for index in range(BATCH):
         state, shown = environment.step(step_keys[index], select(states, index), action_B[index])
         if shown.terminated or shown.truncated:
-            state, fresh = environment.reset(reset_keys[index])
+            state, fresh = reset(environment, reset_keys[index], index)
             shown = shown.replace(observation=fresh.observation, first=fresh.first, turn=fresh.turn)
         results.append((state, shown))
     return jax.tree.map(lambda *arrays: jnp.stack(arrays), *results)
@@ -37,7 +41,7 @@ def follow(environment, steps):
     batched = Batched(environment, BATCH)
     key = jax.random.key(0)
     states, shown = batched.reset(key)
-    singles = [environment.reset(key) for key in jax.random.split(key, BATCH)]
+    singles = [reset(environment, key, index) for index, key in enumerate(jax.random.split(key, BATCH))]
     assert_equal((states, shown), jax.tree.map(lambda *arrays: jnp.stack(arrays), *singles))
     step, seen = jax.jit(batched.step), []
     for key in jax.random.split(jax.random.key(1), steps):
@@ -60,6 +64,7 @@ def test_corridor_one_by_one():
 def test_turns_are_those_of_the_new_episode():
     seen = follow(Pennies(), 9)
     assert seen.turn.player[seen.terminated].tolist() == [0] * 15
+    assert (np.asarray(seen.turn.seat) == [1, 2, 1, 2, 1]).all()  # an environment keeps its seat
 
 
 def test_all_end_at_once():

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.interface.turns import CHANCE, Turn, choose_event
+from suite.interface.turns import CHANCE, Turn, choose_event, stream_action
 
 N = 4000
 
@@ -64,3 +64,13 @@ def test_keys_decide():
     turn = turns(2, [True, True], [0.0, 0.0])
     np.testing.assert_array_equal(events(turn, seed=1), events(turn, seed=1))
     assert (events(turn, seed=1) != events(turn, seed=2)).any()
+
+
+def test_no_two_players_share_an_action_of_the_stream():
+    seen = {int(stream_action(turns(p, [1, 1, 1], [0.5, 0.5]), jnp.full(N, a))[0]) for p in (1, 2) for a in range(3)}
+    assert seen == set(range(6))
+    assert [int(stream_action(turns(CHANCE, [0, 0, 0], [0.5, 0.5]), jnp.full(N, c))[0]) for c in (0, 1)] == [6, 7]
+
+
+def test_a_game_without_chance():
+    assert (events(turns(2, [False, True], [])) == 1).all()
