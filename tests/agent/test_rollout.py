@@ -125,7 +125,7 @@ def test_burn_in_from_zero_sees_only_the_recent_frames():
 def test_events_of_chance_and_the_opponent_are_theirs():
     policy, player, trajectory, _ = roll(Pennies())
     player_TB = jnp.arange(T)[:, None] % 3 + jnp.zeros((T, B), jnp.int32)
-    chex.assert_trees_all_equal(trajectory.acting_TB, player_TB == 1 + jnp.arange(B) % 2)
+    chex.assert_trees_all_equal(trajectory.acting_TB, player_TB == 1 + jnp.arange(B)[None] % 2)
     chance = trajectory.action_TB[player_TB == 0]
     assert set(chance.tolist()) == {0, 2}  # outcome 1 has probability zero
     assert (trajectory.action_TB[player_TB == 2] == 0).all()  # the only legal action
