@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from leaderboards.best_response import REFERENCE, normalized
+
 if TYPE_CHECKING:
     from suite.config import Config
     from suite.interface.environment import EnvironmentSpec
@@ -71,3 +73,54 @@ def craftax_scores(
 def crafter_score(success_percent: list[float]) -> float:
     """exp(mean(ln(1 + s_i))) - 1 over achievements' success rates s_i in percent (Hafner 2021): 0 to 100."""
     return float(np.expm1(np.log1p(success_percent).mean()))
+
+
+def games(
+    episodes: pd.DataFrame | Sequence[Mapping[str, Any]], config: Config | None, spec: EnvironmentSpec
+) -> dict[str, float]:
+    """A two-player game's scores, in its own units, over the episodes that end in the last part of the budget.
+
+    Args:
+      episodes: one row per training episode: `step` at which it ended, `return`, `seat` (1 or 2), and `raw_return`
+        where the reward that is learned from is another.
+      config: says the budget and its last part; without it all episodes count, as in an evaluation.
+      spec: the game's.
+
+    Returns:
+      return_seat_1, return_seat_2: mean raw return in each seat; nan if none of its episodes counts.
+      return: the mean of the two, so that neither seat weighs more by having shorter games.
+      normalized_return: the mean of the two seats' returns on the scale where 0 is the uniform random player and 1 the
+        exact best response, both against the uniform random opponent; only where `best_response.REFERENCE` has them.
+      episodes, final_episodes: how many there were.
+    """
+    episodes, final = _final(episodes, config, ["step", "return", "seat"])
+    raw_return = final["raw_return" if "raw_return" in final else "return"]
+    returns = [float(raw_return[final["seat"] == seat].mean()) for seat in (1, 2)]
+    scores = {"return_seat_1": returns[0], "return_seat_2": returns[1], "return": sum(returns) / 2}
+    if spec.id in REFERENCE:
+        reference = REFERENCE[spec.id]
+        ours = map(normalized, returns, reference.random, reference.best_response)
+        scores["normalized_return"] = sum(ours) / 2
+    return scores | {"episodes": len(episodes), "final_episodes": len(final)}
+
+
+def returns(
+    episodes: pd.DataFrame | Sequence[Mapping[str, Any]], config: Config | None, spec: EnvironmentSpec
+) -> dict[str, float]:
+    """The score of a task without one of its own: `return`, the mean over the episodes that `games` would count."""
+    episodes, final = _final(episodes, config, ["step", "return"])
+    return {"return": float(final["return"].mean()), "episodes": len(episodes), "final_episodes": len(final)}
+
+
+def _final(
+    episodes: pd.DataFrame | Sequence[Mapping[str, Any]], config: Config | None, columns: list[str]
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The episodes within the budget, and those that end in its last part; without a configuration both are all."""
+    episodes = pd.DataFrame(episodes)
+    if episodes.empty:  # then not even the columns need be there
+        episodes = pd.DataFrame(columns=columns, dtype=float)
+    if config is None:
+        return episodes, episodes
+    steps = config.protocol.steps
+    episodes = episodes[episodes["step"] <= steps]
+    return episodes, episodes[episodes["step"] > steps * (1 - config.protocol.final_fraction)]

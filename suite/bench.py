@@ -113,7 +113,7 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
     if replay is not None:
         replay = measure("remember", agent.remember, replay, (trajectory,), 1, policy_type)
     if config.ppo.learn_from_real:
-        learner, _ = measure("learn", agent.learn, learner, (trajectory,), 1, policy_type)
+        learner, _ = measure("learn", agent.learn, learner, (trajectory, jnp.zeros(2, jnp.float32)), 1, policy_type)
     if replay is not None:
         scale = config.tokenizer.updates / max(1, agent.config.tokenizer.updates)
         arguments: tuple[Any, ...] = (replay, keys[2])

@@ -119,7 +119,11 @@ class WorldModelConfig:
     layers: Positive = 3
     heads: Positive = 8
     dropout: Rate = 0.1  # embedding, attention and residual
+    initial_std: PositiveFloat = 0.02  # of every kernel and embedding, GPT-2's; narrow models learn faster from more
     positions: Literal["flat", "grid"] = "flat"  # RoPE over the token index, or over (time, row, column): note 20
+    # Symbols are embedded by value and place, since the same value means different things in different places; the
+    # paper does not say. false: by value alone, as patches are.
+    symbol_places: bool = True
     reward_classes: tuple[float, ...] | None = None  # None: the task's levels
     mask_after_done: bool = False  # drop losses after an episode's end inside a sequence: note 21
     sequences: Positive = 48  # per update, over all minibatches (N_env in Algorithm 5)

@@ -22,6 +22,8 @@ from suite.policy.actor_critic import make_policy
 from suite.registry import Source
 from suite.world_model.transformer import WorldModel
 
+MORE = ", if chance never acted: its events do not count as steps"
+
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
@@ -90,8 +92,9 @@ def describe(layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec) -> 
         tokenizer, tokens, grid = build_tokenizer(config, spec)
         world_model = nnx.eval_shape(lambda: WorldModel(config.world_model, tokens, grid, nnx.Rngs(0)))
         modules["world_model"] = _layers(world_model)
-        modules["codebook"] = _group(jax.eval_shape(tokenizer.init, jax.random.key(0)))
-    return Description(_settings(layers), modules, _derived(config))
+        if codebook := _group(jax.eval_shape(tokenizer.init, jax.random.key(0))):
+            modules["codebook"] = codebook
+    return Description(_settings(layers), modules, _derived(config, spec))
 
 
 def _settings(layers: Sequence[tuple[Source, Config]]) -> list[Setting]:
@@ -116,10 +119,10 @@ def _group(tree: Any) -> list[Layer]:
     return [Layer(name, arrays) for name, arrays in shapes.items()]
 
 
-def _derived(config: Config) -> list[tuple[str, int, str]]:
+def _derived(config: Config, spec: EnvironmentSpec) -> list[tuple[str, int, str]]:
     derived = [
         ("steps per iteration", config.steps_per_iteration, "environment.num_envs x environment.rollout_length"),
-        ("iterations", config.iterations, "whole ones that fit protocol.steps"),
+        ("iterations", config.iterations, "whole ones that fit protocol.steps" + MORE * bool(spec.chance_outcomes)),
         ("real steps", config.total_steps, "iterations x steps per iteration"),
     ]
     if config.world_model.enabled:

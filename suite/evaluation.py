@@ -22,8 +22,10 @@ from suite.record import RunRecord
 from suite.reporting import Reporter
 
 
-def episode_rows(log: EpisodeLog, spec: EnvironmentSpec, ended_TB: np.ndarray, first_step: int) -> list[dict[str, Any]]:
-    """One row per ended episode, in the order of play.
+def episode_rows(
+    log: EpisodeLog, spec: EnvironmentSpec, ended_TB: np.ndarray, first_step: int
+) -> tuple[list[dict[str, Any]], int]:
+    """One row per ended episode, in the order of play, and how many real steps were taken.
 
     Args:
       log: totals at every step, on the host.
@@ -33,10 +35,10 @@ def episode_rows(log: EpisodeLog, spec: EnvironmentSpec, ended_TB: np.ndarray, f
         and including its last.
     """
     rows = []
-    num_envs = ended_TB.shape[1]
+    steps_T = first_step + np.cumsum(log.counts_TB.sum(axis=1))
     for t, b in zip(*np.nonzero(ended_TB), strict=True):
         row: dict[str, Any] = {
-            "step": first_step + (int(t) + 1) * num_envs,
+            "step": int(steps_T[t]),
             "return": float(log.return_TB[t, b]),
             "length": int(log.length_TB[t, b]),
         }
@@ -47,7 +49,7 @@ def episode_rows(log: EpisodeLog, spec: EnvironmentSpec, ended_TB: np.ndarray, f
             else:
                 row[name] = float(value)
         rows.append(row)
-    return rows
+    return rows, int(log.counts_TB.sum())
 
 
 def play_episodes(agent: Agent, learner: Learner, key: jax.Array, episodes: int) -> list[dict[str, Any]]:
@@ -68,9 +70,10 @@ def play_episodes(agent: Agent, learner: Learner, key: jax.Array, episodes: int)
             log = jax.device_get(log)
             earlier_TB = np.cumsum(log.ended_TB, axis=0) - log.ended_TB  # ends before each step
             ended_TB = log.ended_TB & (earlier_TB == 0) & unfinished_B
-            rows += episode_rows(log, agent.spec, ended_TB, step)
+            ended, taken = episode_rows(log, agent.spec, ended_TB, step)
+            rows += ended
             unfinished_B &= ~log.ended_TB.any(axis=0)
-            step += log.ended_TB.size
+            step += taken
     return rows
 
 

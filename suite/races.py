@@ -157,7 +157,7 @@ def _first_training_step(config: Config) -> None:
     state = agent.init(jax.random.key(0))
     player, trajectory, _ = agent.collect(state.learner.acting, state.player, jax.random.key(1))
     if config.ppo.learn_from_real:
-        jax.block_until_ready(agent.learn(state.learner, trajectory))
+        jax.block_until_ready(agent.learn(state.learner, trajectory, jnp.zeros(2, jnp.float32)))
     jax.block_until_ready(player)
 
 

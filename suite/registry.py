@@ -7,6 +7,7 @@ an `AgentEntry`. This module imports neither JAX nor any game.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import importlib.metadata
 from collections.abc import Callable, Mapping, Sequence
@@ -22,14 +23,24 @@ Transform = Callable[[Config], Config]
 
 @dataclasses.dataclass(frozen=True)
 class Lazy:
-    """Something at "module:name", imported when it is asked for."""
+    """Something at "module:name", imported when it is asked for; `arguments` are a function's first ones."""
 
     reference: str
+    arguments: tuple[Any, ...] = ()
 
     def __call__(self) -> Any:
         """Imports it."""
         module, name = self.reference.split(":")
-        return getattr(importlib.import_module(module), name)
+        found = getattr(importlib.import_module(module), name)
+        return functools.partial(found, *self.arguments) if self.arguments else found
+
+
+class Made(Lazy):
+    """What the function at "module:name" makes of the arguments, when it is asked for."""
+
+    def __call__(self) -> Any:
+        """Imports and calls it."""
+        return super().__call__()()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +97,51 @@ class PresetEntry:
 
 Entry = TypeVar("Entry", TaskEntry, AgentEntry)
 
+
+def _game(name: str, summary: str = "", cost: str = "") -> TaskEntry:
+    return TaskEntry(
+        id=f"openspiel/{name}",
+        family="openspiel",
+        summary=summary or f"{name} of OpenSpiel against a uniform opponent, both seats",
+        spec=Made("adapters.openspiel:spec", (name,)),
+        make=Lazy("adapters.openspiel:make", (name,)),
+        scores=Lazy("leaderboards.scoring:games"),
+        presets={
+            "paper": Lazy("baselines.presets:openspiel_paper"),
+            "small": Lazy("baselines.presets:openspiel_small"),
+            "smoke": Lazy("baselines.presets:openspiel_smoke"),
+        },
+        cost=cost,
+    )
+
+
+def _foreign(family: str, name: str, scores: str) -> TaskEntry:
+    return TaskEntry(
+        id=f"{family}/{name}",
+        family=family,
+        summary=f"{name} of {family}",
+        spec=Made(f"adapters.{family}_bridge:spec", (name,)),
+        make=Lazy(f"adapters.{family}_bridge:make", (name,)),
+        scores=Lazy(f"leaderboards.scoring:{scores}"),
+        presets={
+            "small": Lazy("baselines.presets:foreign_small"),
+            "smoke": Lazy("baselines.presets:foreign_smoke"),
+        },
+        cost="",
+    )
+
+
+# Families with more tasks than are listed: any game of the library by its id.
+FAMILIES: dict[str, Callable[[str], TaskEntry]] = {
+    "openspiel": _game,
+    "gymnasium": lambda name: _foreign("gymnasium", name, "returns"),
+    "pettingzoo": lambda name: _foreign("pettingzoo", name, "games"),
+}
+
 TASKS = (
+    _game("tic_tac_toe", "tic-tac-toe against a uniform opponent, both seats: 27 symbols, 9 actions"),
+    _game("leduc", "Leduc poker against a uniform opponent, both seats: 16 symbols, 3 actions, 6 chance outcomes"),
+    _game("bargaining", "bargaining, uniform opponent, both seats: 93 symbols, 121 actions, 1002 chance outcomes"),
     TaskEntry(
         id="craftax_classic",
         family="craftax_classic",
@@ -154,7 +209,7 @@ def task(id: str) -> TaskEntry:
     Raises:
       UserError: there is none.
     """
-    return _find("task", id, tasks())
+    return _find_task(id)
 
 
 def agent(id: str) -> AgentEntry:
@@ -200,7 +255,7 @@ def layers(
     steps: int | None = None,
 ) -> list[tuple[Source, Config]]:
     """As `resolve`, with the configuration after each source's changes; the last is the run's."""
-    task_entry, agent_entry = _find("task", task, tasks()), _find("agent", agent, agents())
+    task_entry, agent_entry = _find_task(task), _find("agent", agent, agents())
     changes = parse_overrides(overrides)
     if steps is not None:
         changes["protocol.steps"] = steps
@@ -241,6 +296,16 @@ def _find(kind: str, id: str, entries: Mapping[str, Any]) -> Any:
     if id not in entries:
         raise UserError(f"unknown {kind} {id!r}; {did_you_mean(id, entries)}")
     return entries[id]
+
+
+def _find_task(id: str) -> TaskEntry:
+    family, _, name = id.partition("/")
+    known = tasks()
+    if id not in known and name and family in FAMILIES:
+        entry = FAMILIES[family](name)
+        entry.spec()  # which says what is wrong with a name that it does not know
+        return entry
+    return _find("task", id, known)
 
 
 def _with_plugins(own: tuple[Entry, ...], group: str, kind: type[Entry]) -> dict[str, Entry]:

@@ -68,28 +68,31 @@ class _Training:
         self.config, self.agent, self.record, self.reporter = config, agent, record, reporter
         self.checkpoints = record.folder / "checkpoints"
         self.key = jax.random.key(self.config.seed)
-        self.iteration = 0
+        self.iteration = self.steps = 0
         self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
         self.recorded_seconds: dict[str, float] = {}  # of those, what timing.csv has
         self.stop_requested = False
 
     @property
-    def steps(self) -> int:
-        return self.iteration * self.config.steps_per_iteration
+    def done(self) -> bool:
+        """No whole iteration fits the budget any more."""
+        return self.steps + self.config.steps_per_iteration > self.config.protocol.steps
 
     def run(self) -> Result:
         started = time.monotonic()
-        self.reporter.start(self.config.total_steps, 0)
+        self.reporter.start(self.config.protocol.steps, 0)
         try:
             with self._phase("start"):
                 state = self._restore()
-            self.reporter.start(self.config.total_steps, self.steps)
+            self.reporter.start(self.config.protocol.steps, self.steps)
             with self._signals():
-                while self.iteration < self.config.iterations and not self.stop_requested:
+                while not self.done and not self.stop_requested:
+                    before = self.steps
                     state = self._iterate(state)
-                    if self._checkpoint_due() or self.stop_requested:
+                    every = self.config.checkpoint.every_steps
+                    if self.steps // every > before // every or self.stop_requested:
                         self._save(state)
-                if self.iteration == self.config.iterations:
+                if self.done:
                     self._finish(state)
                 else:
                     self.record.update(status="stopped")
@@ -110,7 +113,7 @@ class _Training:
             return self.agent.init(init_key)
         for warning in restored.warnings:
             self.reporter.warning(warning)
-        self.iteration = restored.host["iteration"]
+        self.iteration, self.steps = restored.host["iteration"], restored.host["steps"]
         self.seconds = restored.host["seconds"]
         self.recorded_seconds = dict(self.seconds)
         self.record.rewind(self.steps)
@@ -130,11 +133,12 @@ class _Training:
                 replay = agent.remember(replay, trajectory)
             log = jax.device_get(log)
             reward = float(trajectory.reward_TB.mean())
-        rows = episode_rows(log, agent.spec, log.ended_TB, self.steps)
-        self.iteration += 1
+            rows, taken = episode_rows(log, agent.spec, log.ended_TB, self.steps)
+        before = self.steps
+        self.iteration, self.steps = self.iteration + 1, self.steps + taken
         if config.ppo.learn_from_real and config.policy.kind != "uniform":
             with self._phase("learn"):
-                learner, found = agent.learn(learner, trajectory)
+                learner, found = agent.learn(learner, trajectory, jnp.array([before, self.steps], jnp.float32))
                 metrics |= self._check("learn", found)
         del trajectory
         if world_model is not None:
@@ -183,13 +187,9 @@ class _Training:
                 raise RunError(f"{name} became {value} in phase {phase} at step {self.steps:,}; {where}")
         return found
 
-    def _checkpoint_due(self) -> bool:
-        every = self.config.checkpoint.every_steps
-        return self.steps // every > (self.steps - self.config.steps_per_iteration) // every
-
     def _save(self, state: TrainState) -> None:
         with self._phase("checkpoint"):
-            host = {"iteration": self.iteration, "seconds": self.seconds}
+            host = {"iteration": self.iteration, "steps": self.steps, "seconds": self.seconds}
             model, resume = _split(state)
             checkpoint.save(self.checkpoints, self.steps, model, resume, host, keep=self.config.checkpoint.keep)
 

@@ -16,12 +16,12 @@ import pytest
 from suite import checkpoint, evaluation, registry, run
 from suite.errors import RunError, UserError
 from suite.reporting import QuietReporter
-from tests.tiny import CORRIDOR
+from tests.tiny import CORRIDOR, PENNIES
 
 
 @pytest.fixture(autouse=True)
 def corridor(monkeypatch):
-    monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR))
+    monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR, PENNIES))
 
 
 class StopAt(QuietReporter):
@@ -194,3 +194,26 @@ def test_a_broken_checkpoint_gives_way_to_the_one_before(tmp_path, uninterrupted
 def test_resume_without_a_run_is_an_error(tmp_path):
     with pytest.raises(UserError, match="nothing to resume"):
         run.run(config(), tmp_path, QuietReporter(), resume=True)
+
+
+def test_chance_does_not_count_towards_the_budget(tmp_path):
+    """Fidelity note 32. An episode of pennies is three events, one of them chance's; all environments are in step."""
+    result = run.run(registry.resolve("pennies", "mfrl", "smoke"), tmp_path, QuietReporter())
+    # 4 environments play 8 events: three, two and three of chance's in turn.
+    steps = pd.read_csv(result.folder / "metrics.csv")["step"]
+    assert steps.diff().tolist()[1:4] == [24, 20, 20] and steps[0] == 20
+    assert 150 - 32 < result.steps == steps.iloc[-1] <= 150
+    episodes = pd.read_csv(result.folder / "episodes.csv")
+    assert (episodes["length"] == 3).all()
+    assert episodes["step"].tolist()[:8] == [8] * 4 + [16] * 4  # two of three events count, in four environments
+    assert set(episodes["return"]) == {-1.0, 1.0}
+
+
+def test_a_game_that_was_stopped_goes_on_where_it_was(tmp_path):
+    config = registry.resolve("pennies", "m5", "smoke")
+    whole = run.run(config, tmp_path / "whole", QuietReporter())
+    assert run.run(config, tmp_path / "parts", StopAt("imagine", 2)).status == "stopped"
+    parts = run.run(config, tmp_path / "parts", QuietReporter())
+    assert parts.status == "finished" and files(parts.folder) == files(whole.folder)
+    metrics = pd.read_csv(whole.folder / "metrics.csv")
+    assert metrics["world_model/legal_accuracy"].notna().all() and metrics["world_model/chance_excess"].notna().all()

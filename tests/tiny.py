@@ -109,6 +109,24 @@ class Pennies:
         return TimeStep(ours, reward, terminated, no, first, ours, {}, turn)
 
 
+def make_pennies(progress=None) -> Pennies:
+    """As a task's factory."""
+    return Pennies()
+
+
+def pennies_smoke(config: Config) -> Config:
+    """The corridor's, with a world model that is large enough for the rules."""
+    return apply_changes(
+        corridor_smoke(config),
+        {
+            "protocol.steps": 150,
+            "world_model.initial_std": 0.1,
+            "world_model.embed_dim": 32,
+            "imagination.start_step": 40,
+        },
+    )
+
+
 def make_corridor(progress=None) -> Corridor:
     """As a task's factory."""
     return Corridor()
@@ -156,4 +174,14 @@ CORRIDOR = TaskEntry(
     make=Lazy("tests.tiny:make_corridor"),
     scores=Lazy("leaderboards.scoring:craftax"),
     presets={"smoke": Lazy("tests.tiny:corridor_smoke")},
+)
+
+PENNIES = TaskEntry(
+    id="pennies",
+    family="pennies",
+    summary="for tests",
+    spec=Lazy("tests.tiny:PENNIES_SPEC"),
+    make=Lazy("tests.tiny:make_pennies"),
+    scores=Lazy("leaderboards.scoring:returns"),
+    presets={"smoke": Lazy("tests.tiny:pennies_smoke")},
 )

@@ -19,11 +19,11 @@ from suite.agent.replay import Replay, ReplayState
 from suite.config import Config
 from suite.interface.batching import Batched
 from suite.interface.environment import Environment, EnvironmentSpec
-from suite.interface.tokens import TokenizerState, TokenSpec
+from suite.interface.tokens import TokenizerState, TokenSpec, encode_frame
+from suite.interface.turns import stream_action
 from suite.policy import ppo
 from suite.policy.actor_critic import make_policy
 from suite.tokenizers import make_tokenizer
-from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
 from suite.world_model import training as world_model_training
 from suite.world_model.imagination import Dream
 from suite.world_model.transformer import WorldModel
@@ -49,18 +49,21 @@ class TrainState:
     world_model: world_model_training.WorldModelLearner | None = None
 
 
-def build_tokenizer(
-    config: Config, spec: EnvironmentSpec
-) -> tuple[NearestNeighborTokenizer, TokenSpec, tuple[int, int]]:
-    """The tokenizer, the token stream it makes for the world model, and the patches' (rows, columns)."""
+def build_tokenizer(config: Config, spec: EnvironmentSpec) -> tuple[Any, TokenSpec, tuple[int, int]]:
+    """The tokenizer, the token stream it makes for the world model, and the frame's (rows, columns) of tokens."""
     tokenizer = make_tokenizer(config.tokenizer, spec.observation)
+    rows, columns = tokenizer.grid
+    players = 2 if spec.two_player else 1
     tokens = TokenSpec(
-        tokens_per_frame=tokenizer.tokens_per_frame,
+        tokens_per_frame=players * tokenizer.tokens_per_frame,
         num_codes=tokenizer.num_codes,
-        num_actions=spec.num_actions,
+        num_actions=players * spec.num_actions + spec.chance_outcomes,
         reward_classes=config.world_model.reward_classes or spec.reward_classes,
+        placed=spec.observation.kind == "symbols" and config.world_model.symbol_places,
+        player_actions=spec.num_actions if spec.two_player else 0,
+        chance_outcomes=spec.chance_outcomes,
     )
-    return tokenizer, tokens, tokenizer.grid
+    return tokenizer, tokens, (players * rows, columns)
 
 
 class Agent:
@@ -77,8 +80,7 @@ class Agent:
         self.spec = spec = environment.spec
         self.batched = Batched(environment, config.environment.num_envs)
         self.policy_graph = nnx.graphdef(nnx.eval_shape(lambda: self._new_policy(nnx.Rngs(0))))
-        updates = config.iterations * config.ppo.epochs * config.ppo.minibatches
-        self.policy_optimizer = ppo.make_optimizer(config.ppo, updates if config.ppo.anneal_learning_rate else None)
+        self.policy_optimizer = ppo.make_optimizer(config.ppo)
         if config.world_model.enabled:
             self.replay = Replay.of(config)
             self.tokenizer, self.tokens, self.grid = build_tokenizer(config, spec)
@@ -93,7 +95,7 @@ class Agent:
             phases["learn"] = ppo.METRICS
         if self.config.world_model.enabled:
             phases["tokenizer"] = self.tokenizer.metrics
-            phases["world_model"] = world_model_training.METRICS
+            phases["world_model"] = world_model_training.metrics_of(self.tokens)
             phases["imagine"] = IMAGINATION_METRICS
         return [f"{phase}/{metric}" for phase, metrics in phases.items() for metric in metrics]
 
@@ -149,9 +151,10 @@ class Agent:
         return self.replay.add(replay, trajectory)
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
-    def learn(self, learner: ppo.Learner, trajectory: ppo.Trajectory) -> tuple[ppo.Learner, Metrics]:
-        """Step 2: PPO on the real steps."""
+    def learn(self, learner: ppo.Learner, trajectory: ppo.Trajectory, steps: jax.Array) -> tuple[ppo.Learner, Metrics]:
+        """Step 2: PPO on the real steps. `steps`: float32 [2], taken before and after them."""
         config = self.config.ppo
+        left = jnp.maximum(1 - steps / self.config.total_steps, 0.0)
         return ppo.update(
             config,
             self.policy_optimizer,
@@ -161,6 +164,7 @@ class Agent:
             epochs=config.epochs,
             minibatches=config.minibatches,
             entropy_coefficient=config.entropy_coefficient,
+            remaining=(left[0], left[1]) if config.anneal_learning_rate else None,
         )
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
@@ -194,12 +198,14 @@ class Agent:
             sample_key, dropout_key = jax.random.split(key)
             length = config.sequence_length + 1
             batch = self.replay.sample(replay, sample_key, config.sequences // config.minibatches, length)
+            action_BT = batch.action if batch.turn is None else stream_action(batch.turn, batch.action)
             sequences = world_model_training.Sequences(
-                tokens_BTL=self.tokenizer.encode(tokenizer, batch.observation),
-                action_BT=batch.action[:, :-1],
+                tokens_BTL=encode_frame(self.tokenizer, tokenizer, batch.observation, batch.turn),
+                action_BT=action_BT[:, :-1],
                 reward_BT=batch.reward[:, :-1],
                 terminated_BT=batch.terminated[:, :-1],
                 ended_BT=batch.first[:, 1:],
+                turn_BT=batch.turn,
             )
             return world_model_training.update(
                 config,
@@ -249,12 +255,20 @@ class Agent:
         sample_key, start_key, rollout_key = jax.random.split(key, 3)
         past = self.replay.sample(replay, sample_key, plan.num_envs, self.config.environment.burn_in + 1)
         past = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), past)
-        dream = Dream(model, self.tokenizer, tokenizer, self.spec, self.tokens, plan.horizon, past.observation[-1])
+        start_turn_B = jax.tree.map(lambda x: x[-1], past.turn)
+        dream = Dream(
+            model, self.tokenizer, tokenizer, self.spec, self.tokens, plan.horizon, past.observation[-1], start_turn_B
+        )
         player = play.start(policy, dream, start_key, 0)
         player = dataclasses.replace(
             player,
             time_step=dataclasses.replace(player.time_step, first=past.first[-1]),
-            recent=play.Recent(past.observation[:-1], past.first[:-1], player.hidden_BH),
+            recent=play.Recent(
+                past.observation[:-1],
+                past.first[:-1],
+                player.hidden_BH,
+                None if past.turn is None else past.turn.ours[:-1],
+            ),
         )
         player = play.refresh(policy, player, carried=False)
         _, trajectory, _ = play.rollout(rollout_key, policy, learner.targets, dream, player, plan.horizon)

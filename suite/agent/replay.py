@@ -16,6 +16,7 @@ from flax import struct
 
 from suite.config import Config
 from suite.interface.environment import EnvironmentSpec
+from suite.interface.turns import Turn
 from suite.policy.ppo import Trajectory
 
 ReplayState = Any  # flashbax's TrajectoryBufferState
@@ -31,6 +32,7 @@ class Experience:
       reward: float32.
       terminated: bool; the step ended the episode by the rules.
       first: bool; the frame opens an episode.
+      turn: whose move it was and what was allowed; None for single-agent tasks.
     """
 
     observation: jax.Array
@@ -38,6 +40,7 @@ class Experience:
     reward: jax.Array
     terminated: jax.Array
     first: jax.Array
+    turn: Turn | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +74,7 @@ class Replay:
             reward=jnp.zeros((), jnp.float32),
             terminated=jnp.zeros((), bool),
             first=jnp.zeros((), bool),
+            turn=_no_turn(spec) if spec.two_player else None,
         )
         return self._buffer(1, 1).init(step)
 
@@ -82,6 +86,7 @@ class Replay:
             reward=trajectory.reward_TB,
             terminated=trajectory.terminated_TB,
             first=trajectory.first_TB,
+            turn=trajectory.turn_TB,
         )
         return self._buffer(1, 1).add(state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), experience))
 
@@ -89,3 +94,13 @@ class Replay:
         """`batch` sequences of `length` consecutive steps, uniform over all stored; leading axes [batch, length]."""
         with jax.numpy_rank_promotion("allow"):  # flashbax broadcasts as NumPy does
             return self._buffer(batch, length).sample(state, key).experience
+
+
+def _no_turn(spec: EnvironmentSpec) -> Turn:
+    return Turn(
+        player=jnp.zeros((), jnp.int32),
+        seat=jnp.zeros((), jnp.int32),
+        legal_A=jnp.zeros(spec.num_actions, bool),
+        chance_C=jnp.zeros(spec.chance_outcomes, jnp.float32),
+        opponent_observation=jnp.zeros(spec.observation.shape, jnp.uint8),
+    )

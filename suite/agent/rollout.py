@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from suite.interface.environment import BatchedEnvironment, State, TimeStep
-from suite.interface.turns import choose_event
+from suite.interface.turns import CHANCE, choose_event
 from suite.policy.actor_critic import mask_logits
 from suite.policy.ppo import TargetStatistics, Trajectory
 
@@ -42,7 +42,7 @@ class Player:
       hidden_BH: the policy's memory before it sees that.
       recent: the M events before.
       return_B: float32 reward so far in the running episodes.
-      length_B: int32 events so far in the running episodes.
+      length_B: int32 events so far in the running episodes, chance's included.
     """
 
     state: State
@@ -55,8 +55,12 @@ class Player:
 
 @struct.dataclass
 class EpisodeLog:
-    """At every step [T, B], the running episode's totals; an episode's final ones stand where `ended_TB`."""
+    """At every step [T, B], the running episode's totals; an episode's final ones stand where `ended_TB`.
 
+    `counts_TB`: bool; the step counts towards the budget: all but chance's events (note 32).
+    """
+
+    counts_TB: jax.Array
     ended_TB: jax.Array
     return_TB: jax.Array
     length_TB: jax.Array
@@ -161,10 +165,10 @@ def rollout(
             hidden_BH=player.hidden_BH,
             last_value_B=jnp.zeros_like(after.reward),
             truncation_value_TB=truncation_value_B,
-            acting_TB=None if turn is None else turn.ours,
-            legal_TBA=None if turn is None else turn.legal_A,
+            turn_TB=turn,
         )
-        log = EpisodeLog(ended_B, return_B, length_B, after.statistics)
+        counts_B = jnp.ones_like(ended_B) if turn is None else turn.player != CHANCE
+        log = EpisodeLog(counts_B, ended_B, return_B, length_B, after.statistics)
         player = dataclasses.replace(
             player,
             state=state,
@@ -179,14 +183,19 @@ def rollout(
     player, (steps, log) = jax.lax.scan(event, player, jax.random.split(key, length))
     memory_TBH = steps.hidden_BH  # before each step; PPO needs the first, burn-in the one M steps ago
     last, _ = policy(player.time_step.observation[None], player.time_step.first[None], player.hidden_BH)
-    trajectory = dataclasses.replace(steps, hidden_BH=memory_TBH[0], last_value_B=targets.denormalize(last.value_TB[0]))
+    trajectory = dataclasses.replace(
+        steps,
+        hidden_BH=memory_TBH[0],
+        last_value_B=targets.denormalize(last.value_TB[0]),
+        last_ours_B=None if player.time_step.turn is None else player.time_step.turn.ours,
+    )
     if burn_in := start_recent.first_MB.shape[0]:
         since = length - burn_in  # not negative: suite.config sees to it
         recent = Recent(
             observation_MB=trajectory.observation_TB[since:],
             first_MB=trajectory.first_TB[since:],
             hidden_BH=memory_TBH[since],
-            acting_MB=None if trajectory.acting_TB is None else trajectory.acting_TB[since:],
+            acting_MB=None if trajectory.turn_TB is None else trajectory.turn_TB.ours[since:],
         )
         player = dataclasses.replace(player, recent=recent)
     return player, trajectory, log

@@ -6,6 +6,7 @@ Shapes: B environments side by side, T steps. A suffix names the leading axes of
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Literal, Protocol
 
 import jax
@@ -96,10 +97,11 @@ class Environment(Protocol):
 
     spec: EnvironmentSpec
 
-    def reset(self, key: jax.Array, seat: jax.Array | None = None) -> tuple[State, TimeStep]:
-        """A freshly generated episode and its first time step (`first` true, reward 0).
+    @property
+    def reset(self) -> Callable[..., tuple[State, TimeStep]]:
+        """`reset(key)`: a freshly generated episode and its first time step (`first` true, reward 0).
 
-        `seat`: int32 scalar, which of a game's two players is ours (1 or 2); None for single-agent tasks, always.
+        Of a two-player game `reset(key, seat)`; `seat`: int32 scalar, which of its players is ours (1 or 2).
         """
 
     def step(self, key: jax.Array, state: State, action: jax.Array) -> tuple[State, TimeStep]:

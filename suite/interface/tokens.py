@@ -8,20 +8,37 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
+from suite.interface.turns import Turn
+
 TokenizerState = Any  # A tokenizer's own pytree of arrays: parameters, codebook, optimizer.
 
 
 @dataclasses.dataclass(frozen=True)
 class TokenSpec:
-    """The vocabulary of one token stream: L tokens per frame out of K codes, A actions, the reward classes.
+    """The vocabulary of one token stream, and what is predicted of it.
 
-    `reward_classes` are ascending reward levels; see `EnvironmentSpec.reward_classes`.
+    Attributes:
+      tokens_per_frame: L; in a game both players' observations, player 1's first.
+      num_codes: K.
+      num_actions: of the stream; in a game those of both players and chance, see `turns.stream_action`.
+      reward_classes: ascending reward levels; see `EnvironmentSpec.reward_classes`.
+      placed: a code means something else at each of the L places, and is embedded so.
+      player_actions: A of a two-player game, whose turns are predicted too; 0 for single-agent tasks.
+      chance_outcomes: C of a two-player game.
     """
 
     tokens_per_frame: int
     num_codes: int
     num_actions: int
     reward_classes: tuple[float, ...]
+    placed: bool = False
+    player_actions: int = 0
+    chance_outcomes: int = 0
+
+    @property
+    def two_player(self) -> bool:
+        """Whether the stream is a game's."""
+        return self.player_actions > 0
 
     def reward_to_class(self, reward: jax.Array) -> jax.Array:
         """int32 index of the level nearest to each reward, ties to the higher level (fidelity note 22)."""
@@ -66,3 +83,25 @@ class Tokenizer(Protocol):
 
     def valid_codes(self, state: TokenizerState) -> jax.Array:
         """Bool [K]: codes that have a meaning; the others must never be sampled."""
+
+
+def encode_frame(tokenizer: Tokenizer, state: TokenizerState, observation: jax.Array, turn: Turn | None) -> jax.Array:
+    """int32 tokens [..., L] of a frame: the observation's; in a game player 1's observation, then player 2's."""
+    ours = tokenizer.encode(state, observation)
+    if turn is None:
+        return ours
+    theirs = tokenizer.encode(state, turn.opponent_observation)
+    first = (turn.seat == 1)[..., None]
+    return jnp.concatenate([jnp.where(first, ours, theirs), jnp.where(first, theirs, ours)], axis=-1)
+
+
+def decode_frame(
+    tokenizer: Tokenizer, state: TokenizerState, tokens: jax.Array, seat: jax.Array | None
+) -> tuple[jax.Array, jax.Array | None]:
+    """The inverse: our observation and, where there is a seat (int32 [...], ours), the other player's."""
+    if seat is None:
+        return tokenizer.decode(state, tokens), None
+    first, second = jnp.split(tokens, 2, axis=-1)
+    ours_first = (seat == 1)[..., None]
+    ours, theirs = jnp.where(ours_first, first, second), jnp.where(ours_first, second, first)
+    return tokenizer.decode(state, ours), tokenizer.decode(state, theirs)

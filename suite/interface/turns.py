@@ -52,8 +52,20 @@ def choose_event(key: jax.Array, turn: Turn, action_B: jax.Array) -> jax.Array:
     `chance_C` (the paper's Section 4.7).
     """
     opponent_key, chance_key = jax.random.split(key)
-    other_B = jax.random.categorical(opponent_key, jnp.where(turn.legal_A, 0.0, -jnp.inf))
+    other_B = _draw(opponent_key, turn.legal_A.astype(jnp.float32))
     if turn.chance_C.shape[-1]:
-        chance_B = jax.random.categorical(chance_key, jnp.log(turn.chance_C))
-        other_B = jnp.where(turn.player == CHANCE, chance_B, other_B)
+        other_B = jnp.where(turn.player == CHANCE, _draw(chance_key, turn.chance_C), other_B)
     return jnp.where(turn.ours, action_B, other_B).astype(jnp.int32)
+
+
+def _draw(key: jax.Array, weight_BN: jax.Array) -> jax.Array:
+    """An index [B] with probability proportional to its weight, which is not negative; 0 where all weights are 0.
+
+    By inverting the cumulative distribution: one random number each, where noise for every one of bargaining's 1002
+    outcomes would cost more than all the rest of an event.
+    """
+    cumulative_BN = jnp.cumsum(weight_BN, axis=-1)
+    total_B1 = cumulative_BN[..., -1:]
+    # Below 1 by more than rounding, so that outcomes of weight 0 at the end are never drawn.
+    share_B1 = jax.random.uniform(key, total_B1.shape) * (1 - 1e-6)
+    return jnp.where(total_B1[..., 0] > 0, (cumulative_BN <= share_B1 * total_B1).sum(-1), 0)

@@ -14,6 +14,7 @@ import optax
 from flax import nnx, struct
 
 from suite.config import PPOConfig
+from suite.interface.turns import Turn
 from suite.policy.actor_critic import PolicyOutput, log_probability, mask_logits
 
 # What `update` reports, in the order of tables and files.
@@ -45,8 +46,8 @@ class Trajectory:
       hidden_BH: float32, the memory before t = 0.
       last_value_B: float32, of the observation after the last step, in units of reward.
       truncation_value_TB: float32, of the last observation of a truncated episode, in units of reward; else 0.
-      acting_TB: bool; our decisions. None: all are.
-      legal_TBA: bool; None: every action is legal.
+      turn_TB: whose turns they were; None for single-agent tasks: all are ours, and every action is legal.
+      last_ours_B: bool; the observation after the last step is ours to act on. None for single-agent tasks.
     """
 
     observation_TB: jax.Array
@@ -60,34 +61,51 @@ class Trajectory:
     hidden_BH: jax.Array
     last_value_B: jax.Array
     truncation_value_TB: jax.Array
-    acting_TB: jax.Array | None = None
-    legal_TBA: jax.Array | None = None
+    turn_TB: Turn | None = None
+    last_ours_B: jax.Array | None = None
+
+    @property
+    def acting_TB(self) -> jax.Array | None:
+        """bool; our decisions. None: all are."""
+        return None if self.turn_TB is None else self.turn_TB.ours
+
+    @property
+    def legal_TBA(self) -> jax.Array | None:
+        """bool; None: every action is legal."""
+        return None if self.turn_TB is None else self.turn_TB.legal_A
 
 
-def generalized_advantages(trajectory: Trajectory, discount: float, gae_lambda: float) -> jax.Array:
-    """Generalized advantage estimates [T, B] (Appendix A.1.2), 0 where the decision is not ours.
+def generalized_advantages(
+    trajectory: Trajectory, discount: float, gae_lambda: float
+) -> tuple[jax.Array, jax.Array | None]:
+    """Generalized advantage estimates [T, B] (Appendix A.1.2), and where they are known (bool; None: everywhere).
 
     `discount` and `gae_lambda` count our decisions, not events. Termination is worth nothing beyond; a truncation
-    has the value of its last observation beyond, and the trace ends at both.
+    has the value of its last observation beyond, and the trace ends at both. Unknown, and 0, are events that are not
+    ours, and our last decision if neither the episode's end nor a further turn of ours follows it: values are learned
+    at our turns only, so none is to be had for what comes after.
     """
     acting_TB = trajectory.acting_TB
-    if acting_TB is None:
-        acting_TB = jnp.ones_like(trajectory.terminated_TB)
 
     def step(carry, inputs):
-        next_value_B, next_advantage_B, pending_B = carry
+        next_value_B, next_advantage_B, pending_B, known_B = carry
         reward_B, value_B, terminated_B, truncated_B, truncation_value_B, acting_B = inputs
         ended_B = terminated_B | truncated_B
         beyond_B = jnp.where(terminated_B, 0.0, truncation_value_B)
         next_value_B = jnp.where(ended_B, beyond_B, next_value_B)
         next_advantage_B = jnp.where(ended_B, 0.0, next_advantage_B)
-        reward_B = reward_B + jnp.where(ended_B, 0.0, pending_B)
+        if acting_B is not None:
+            reward_B = reward_B + jnp.where(ended_B, 0.0, pending_B)
+            known_B = known_B | ended_B
         error_B = reward_B + discount * next_value_B - value_B
         advantage_B = error_B + discount * gae_lambda * next_advantage_B
-        ours = (value_B, advantage_B, jnp.zeros_like(reward_B))
-        theirs = (next_value_B, next_advantage_B, reward_B)
+        if acting_B is None:
+            return (value_B, advantage_B, None, None), (advantage_B, None)
+        advantage_B = jnp.where(known_B, advantage_B, 0.0)
+        ours = (value_B, advantage_B, jnp.zeros_like(reward_B), jnp.ones_like(known_B))
+        theirs = (next_value_B, next_advantage_B, reward_B, known_B)
         carry = jax.tree.map(lambda a, b: jnp.where(acting_B, a, b), ours, theirs)
-        return carry, jnp.where(acting_B, advantage_B, 0.0)
+        return carry, (jnp.where(acting_B, advantage_B, 0.0), known_B & acting_B)
 
     zeros_B = jnp.zeros_like(trajectory.last_value_B)
     inputs = (
@@ -98,8 +116,9 @@ def generalized_advantages(trajectory: Trajectory, discount: float, gae_lambda: 
         trajectory.truncation_value_TB,
         acting_TB,
     )
-    _, advantage_TB = jax.lax.scan(step, (trajectory.last_value_B, zeros_B, zeros_B), inputs, reverse=True)
-    return advantage_TB
+    start = (trajectory.last_value_B, zeros_B, None if acting_TB is None else zeros_B, trajectory.last_ours_B)
+    _, (advantage_TB, known_TB) = jax.lax.scan(step, start, inputs, reverse=True)
+    return advantage_TB, known_TB
 
 
 @struct.dataclass
@@ -168,10 +187,9 @@ class Learner:
         return dataclasses.replace(self, optimizer=None)
 
 
-def make_optimizer(ppo: PPOConfig, total_updates: int | None) -> optax.GradientTransformation:
-    """Adam behind gradient clipping; the rate falls linearly to 0 over `total_updates` minibatches if given."""
-    rate = optax.linear_schedule(ppo.learning_rate, 0.0, total_updates) if total_updates else ppo.learning_rate
-    return optax.chain(optax.clip_by_global_norm(ppo.max_grad_norm), optax.adam(rate, eps=ppo.adam_eps))
+def make_optimizer(ppo: PPOConfig) -> optax.GradientTransformation:
+    """Adam behind gradient clipping, at the full learning rate; `update` anneals it."""
+    return optax.chain(optax.clip_by_global_norm(ppo.max_grad_norm), optax.adam(ppo.learning_rate, eps=ppo.adam_eps))
 
 
 def update(
@@ -184,8 +202,12 @@ def update(
     epochs: int,
     minibatches: int,
     entropy_coefficient: float,
+    remaining: tuple[jax.Array, jax.Array] | None = None,
 ) -> tuple[Learner, dict[str, jax.Array]]:
     """Algorithm 3: `epochs` passes over `minibatches` contiguous groups of environments, unshuffled (note 9).
+
+    With `remaining`, float32 shares of the budget that are left before and after these updates, the learning rate
+    falls from the first to the second share of itself, linearly by minibatch (note 11).
 
     Each minibatch runs the network over all T steps again, from `trajectory.hidden_BH`. Returns the learner and
     the float32 scalars that `METRICS` names, those of the loss averaged over all minibatch updates. Raises
@@ -195,8 +217,8 @@ def update(
     if environments % minibatches:
         raise ValueError(f"{minibatches} minibatches do not divide {environments} environments")
     size = environments // minibatches
-    advantage_TB = generalized_advantages(trajectory, ppo.discount, ppo.gae_lambda)
-    mean, std, _ = _moments(advantage_TB, trajectory.acting_TB)
+    advantage_TB, known_TB = generalized_advantages(trajectory, ppo.discount, ppo.gae_lambda)
+    mean, std, _ = _moments(advantage_TB, known_TB)
     batch = _Batch(
         observation_TB=trajectory.observation_TB,
         first_TB=trajectory.first_TB,
@@ -205,12 +227,14 @@ def update(
         advantage_TB=(advantage_TB - mean) / (std + 1e-8),
         target_TB=advantage_TB + trajectory.value_TB,
         acting_TB=trajectory.acting_TB,
+        known_TB=known_TB,
         legal_TBA=trajectory.legal_TBA,
     )
 
-    def minibatch_update(learner: Learner, index: jax.Array):
+    def minibatch_update(learner: Learner, inputs: tuple[jax.Array, jax.Array | None]):
+        index, rate = inputs
         part, hidden_BH = _environments(batch, trajectory.hidden_BH, index * size, size)
-        targets = learner.targets.update(part.target_TB, part.acting_TB, ppo.target_decay)
+        targets = learner.targets.update(part.target_TB, part.known_TB, ppo.target_decay)
         part = dataclasses.replace(part, target_TB=targets.standardize(part.target_TB))
 
         def loss_of(params: nnx.State):
@@ -222,13 +246,16 @@ def update(
         metrics["gradient_norm"] = optax.tree.norm(gradients)
         with jax.numpy_dtype_promotion("standard"):  # Optax raises floats to integer powers
             changes, state = optimizer.update(gradients, learner.optimizer, learner.params)
+        if rate is not None:
+            changes = jax.tree.map(lambda change: rate * change, changes)
         return Learner(optax.apply_updates(learner.params, changes), state, targets), metrics
 
     order = jnp.tile(jnp.arange(minibatches), epochs)
-    learner, metrics = jax.lax.scan(minibatch_update, learner, order)
+    rates = None if remaining is None else jnp.linspace(*remaining, len(order), endpoint=False)
+    learner, metrics = jax.lax.scan(minibatch_update, learner, (order, rates))
     metrics = {name: value.mean() for name, value in metrics.items()}
 
-    _, target_std, _ = _moments(batch.target_TB, trajectory.acting_TB)
+    _, target_std, _ = _moments(batch.target_TB, known_TB)
     metrics["explained_variance"] = 1.0 - jnp.square(std) / (jnp.square(target_std) + 1e-8)
     metrics["target_mean"], metrics["target_std"] = learner.targets.corrected()
     return learner, metrics
@@ -236,7 +263,10 @@ def update(
 
 @struct.dataclass
 class _Batch:
-    """What the loss needs of each step; `advantage_TB` is standardized, `target_TB` q = A + v."""
+    """What the loss needs of each step; `advantage_TB` is standardized, `target_TB` q = A + v.
+
+    The memory advances where `acting_TB`; the loss is of where `known_TB`.
+    """
 
     observation_TB: jax.Array
     first_TB: jax.Array
@@ -245,6 +275,7 @@ class _Batch:
     advantage_TB: jax.Array
     target_TB: jax.Array
     acting_TB: jax.Array | None
+    known_TB: jax.Array | None
     legal_TBA: jax.Array | None
 
 
@@ -261,9 +292,9 @@ def _loss(
     logits_TBA = mask_logits(output.logits_TBA, batch.legal_TBA)
     log_policy_TBA = jax.nn.log_softmax(logits_TBA)
     log_ratio_TB = log_probability(logits_TBA, batch.action_TB) - batch.log_probability_TB
-    if batch.acting_TB is not None:
+    if batch.known_TB is not None:
         # Someone else's event may be an action that we never take: keep its ratio finite.
-        log_ratio_TB = jnp.where(batch.acting_TB, log_ratio_TB, 0.0)
+        log_ratio_TB = jnp.where(batch.known_TB, log_ratio_TB, 0.0)
     ratio_TB = jnp.exp(log_ratio_TB)
     clipped_TB = jnp.clip(ratio_TB, 1.0 - ppo.clip, 1.0 + ppo.clip)
     gain_TB = jnp.minimum(ratio_TB * batch.advantage_TB, clipped_TB * batch.advantage_TB)
@@ -275,7 +306,7 @@ def _loss(
         "approx_kl": ratio_TB - 1.0 - log_ratio_TB,
         "clip_fraction": (jnp.abs(ratio_TB - 1.0) > ppo.clip).astype(jnp.float32),
     }
-    metrics = {name: _mean(part_TB, batch.acting_TB) for name, part_TB in parts_TB.items()}
+    metrics = {name: _mean(part_TB, batch.known_TB) for name, part_TB in parts_TB.items()}
     loss = (
         metrics["policy_loss"]
         + ppo.value_coefficient * metrics["value_loss"]

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from flax import nnx
+from flax import nnx, struct
 from jax.typing import DTypeLike
 
-INITIAL_STD = 0.02  # of every kernel and embedding, as in GPT-2
-
-
-def initializer() -> nnx.Initializer:
-    """Of every kernel and embedding."""
-    return nnx.initializers.normal(INITIAL_STD)
+from suite.config import WorldModelConfig
+from suite.interface.tokens import TokenSpec
 
 
 class Head(nnx.Module):
@@ -21,9 +17,10 @@ class Head(nnx.Module):
     Products are in `dtype`; logits are accumulated and kept in float32, since their differences decide what is sampled.
     """
 
-    def __init__(self, width: int, classes: int, dtype: DTypeLike, rngs: nnx.Rngs):
-        self.hidden = nnx.Linear(width, width, dtype=dtype, kernel_init=initializer(), rngs=rngs)
-        self.kernel = nnx.Param(initializer()(rngs.params(), (width, classes), jnp.float32))
+    def __init__(self, config: WorldModelConfig, classes: int, dtype: DTypeLike, rngs: nnx.Rngs):
+        width, init = config.embed_dim, nnx.initializers.normal(config.initial_std)
+        self.hidden = nnx.Linear(width, width, dtype=dtype, kernel_init=init, rngs=rngs)
+        self.kernel = nnx.Param(init(rngs.params(), (width, classes), jnp.float32))
         self.bias = nnx.Param(jnp.zeros((classes,), jnp.float32))
         self.dtype = dtype
 
@@ -31,3 +28,39 @@ class Head(nnx.Module):
         features = nnx.relu(self.hidden(hidden))
         logits = jnp.dot(features, self.kernel[...].astype(self.dtype), preferred_element_type=jnp.float32)
         return logits + self.bias[...].reshape((1,) * (logits.ndim - 1) + (-1,))
+
+
+PLAYERS = 3  # chance, player 1, player 2
+
+
+@struct.dataclass
+class TurnLogits:
+    """float32 logits of a game's next turn, with the leading axes of the hidden states they are of.
+
+    Attributes:
+      player: [..., 3]; chance, player 1, player 2.
+      legal: [..., A]; one binary logit for each action of whoever it is that acts.
+      chance: [..., C]; of chance's outcomes.
+    """
+
+    player: jax.Array
+    legal: jax.Array
+    chance: jax.Array
+
+
+class TurnHead(nnx.Module):
+    """The full-information heads of a two-player game (Appendix G, losses 4 to 6)."""
+
+    def __init__(self, config: WorldModelConfig, tokens: TokenSpec, dtype: DTypeLike, rngs: nnx.Rngs):
+        self.player = Head(config, PLAYERS, dtype, rngs)
+        self.legal = Head(config, tokens.player_actions, dtype, rngs)
+        self.chance = Head(config, tokens.chance_outcomes, dtype, rngs) if tokens.chance_outcomes else None
+
+    def __call__(self, hidden: jax.Array) -> TurnLogits:
+        """From hidden states [..., D]."""
+        none = jnp.zeros((*hidden.shape[:-1], 0), jnp.float32)
+        return TurnLogits(
+            player=self.player(hidden),
+            legal=self.legal(hidden),
+            chance=none if self.chance is None else self.chance(hidden),
+        )

@@ -9,16 +9,19 @@ import jax.numpy as jnp
 from flax import struct
 
 from suite.interface.environment import EnvironmentSpec, TimeStep
-from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec
+from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec, decode_frame, encode_frame
+from suite.interface.turns import CHANCE, Turn, stream_action
+from suite.world_model.heads import TurnLogits
 from suite.world_model.transformer import Cache, WorldModel
 
 
 @struct.dataclass
 class DreamState:
-    """The cache of all blocks before this frame, and this frame's tokens (int32 [B, L])."""
+    """The cache of all blocks before this frame, its tokens (int32 [B, L]) and, in a game, whose turn it is."""
 
     cache: Cache
     tokens_BL: jax.Array
+    turn_B: Turn | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,7 +30,8 @@ class Dream:
 
     Every episode starts from a given real frame, and lasts `horizon` steps at most: no more fit into the cache.
     A termination does not end it: the model goes on, and the time step says `first`, so that memory is dropped.
-    Rewards are class levels, nothing is truncated, and time steps carry no statistics (an empty dict) and no turn.
+    Rewards are class levels, nothing is truncated, and time steps carry no statistics (an empty dict). In a game
+    the model also says whose turn is next, what is legal and how chance falls; our seat is the one we started in.
 
     Attributes:
       model: evaluated without dropout.
@@ -36,6 +40,7 @@ class Dream:
       tokens: the stream's vocabulary.
       horizon: T_WM, steps.
       start_observation_BO: uint8; real frames. Callers that know what came before them burn the policy's memory in.
+      start_turn_B: whose turn it is there; None for single-agent tasks.
     """
 
     model: WorldModel
@@ -45,6 +50,7 @@ class Dream:
     tokens: TokenSpec
     horizon: int
     start_observation_BO: jax.Array
+    start_turn_B: Turn | None = None
 
     @property
     def num_envs(self) -> int:
@@ -54,24 +60,30 @@ class Dream:
     def reset(self, key: jax.Array) -> tuple[DreamState, TimeStep]:
         """The start frames as they are, `first` false; `key` is not used."""
         del key
-        tokens_BL = self.tokenizer.encode(self.tokenizer_state, self.start_observation_BO)
+        turn_B = self.start_turn_B
+        tokens_BL = encode_frame(self.tokenizer, self.tokenizer_state, self.start_observation_BO, turn_B)
         never_B = jnp.zeros((self.num_envs,), bool)
         cache = self.model.init_cache(self.num_envs, self.horizon)
-        time_step = _time_step(self.start_observation_BO, jnp.zeros((self.num_envs,), jnp.float32), never_B)
-        return DreamState(cache, tokens_BL), time_step
+        time_step = _time_step(self.start_observation_BO, jnp.zeros((self.num_envs,), jnp.float32), never_B, turn_B)
+        return DreamState(cache, tokens_BL, turn_B), time_step
 
     def step(self, key: jax.Array, state: DreamState, action_B: jax.Array) -> tuple[DreamState, TimeStep]:
-        """Samples reward, termination and the next frame's tokens, given everything since the start frame."""
+        """Samples reward, termination, the next frame's tokens and turn, given everything since the start frame."""
         token_key, reward_key, termination_key = jax.random.split(key, 3)
-        cache, hidden_BSD = self.model.step(state.cache, state.tokens_BL, action_B)
+        turn_B = state.turn_B
+        seat_B = None if turn_B is None else turn_B.seat
+        stream_action_B = action_B if turn_B is None else stream_action(turn_B, action_B)
+        cache, hidden_BSD = self.model.step(state.cache, state.tokens_BL, stream_action_B)
         tokens_BL = sample_next_tokens(
             token_key, self.model.observation_logits(hidden_BSD), self.tokenizer.valid_codes(self.tokenizer_state)
         )
-        reward_class_B = jax.random.categorical(reward_key, self.model.reward_logits(hidden_BSD))
+        reward_class_B = jax.random.categorical(reward_key, self.model.reward_logits(hidden_BSD, seat_B))
         terminated_B = jax.random.categorical(termination_key, self.model.termination_logits(hidden_BSD)) == 1
-        observation_BO = self.tokenizer.decode(self.tokenizer_state, tokens_BL)
-        time_step = _time_step(observation_BO, self.tokens.class_to_reward(reward_class_B), terminated_B)
-        return DreamState(cache, tokens_BL), time_step
+        observation_BO, theirs_BO = decode_frame(self.tokenizer, self.tokenizer_state, tokens_BL, seat_B)
+        if seat_B is not None and theirs_BO is not None:
+            turn_B = next_turn(jax.random.fold_in(key, 3), self.model.turn_logits(hidden_BSD), seat_B, theirs_BO)
+        time_step = _time_step(observation_BO, self.tokens.class_to_reward(reward_class_B), terminated_B, turn_B)
+        return DreamState(cache, tokens_BL, turn_B), time_step
 
 
 def sample_next_tokens(key: jax.Array, logits_BLK: jax.Array, valid_K: jax.Array) -> jax.Array:
@@ -87,7 +99,29 @@ def sample_next_tokens(key: jax.Array, logits_BLK: jax.Array, valid_K: jax.Array
     return (cumulative_BLK <= uniform_BL1 * cumulative_BLK[..., -1:]).sum(-1, dtype=jnp.int32)
 
 
-def _time_step(observation_BO: jax.Array, reward_B: jax.Array, terminated_B: jax.Array) -> TimeStep:
+def next_turn(key: jax.Array, logits_B: TurnLogits, seat_B: jax.Array, opponent_observation_BO: jax.Array) -> Turn:
+    """The turn that a game's world model predicts: a sampled player, and what is then legal, or chance's odds.
+
+    An action is legal if that is likelier than not, and the likeliest always is: somebody must be able to move.
+    """
+    outcomes = logits_B.chance.shape[-1]
+    acts_1P = jnp.array([[outcomes > 0, True, True]])  # chance, unless there is none
+    player_B = jax.random.categorical(key, jnp.where(acts_1P, logits_B.player, -jnp.inf)).astype(jnp.int32)
+    chance_B1 = (player_B == CHANCE)[:, None]
+    legal_BA = (logits_B.legal > 0) | (logits_B.legal >= logits_B.legal.max(-1, keepdims=True))
+    chance_BC = jax.nn.softmax(logits_B.chance) if outcomes else logits_B.chance
+    return Turn(
+        player=player_B,
+        seat=seat_B,
+        legal_A=legal_BA & ~chance_B1,
+        chance_C=jnp.where(chance_B1, chance_BC, 0.0),
+        opponent_observation=opponent_observation_BO,
+    )
+
+
+def _time_step(
+    observation_BO: jax.Array, reward_B: jax.Array, terminated_B: jax.Array, turn_B: Turn | None
+) -> TimeStep:
     return TimeStep(
         observation=observation_BO,
         reward=reward_B,
@@ -96,4 +130,5 @@ def _time_step(observation_BO: jax.Array, reward_B: jax.Array, terminated_B: jax
         first=terminated_B,
         final_observation=observation_BO,
         statistics={},
+        turn=turn_B,
     )

@@ -11,6 +11,8 @@ from flax import nnx, struct
 
 from suite.config import WorldModelConfig
 from suite.interface.tokens import TokenSpec
+from suite.interface.turns import CHANCE, Turn
+from suite.world_model.heads import TurnLogits
 from suite.world_model.transformer import WorldModel
 
 CHUNK_LOGITS = 2**25  # observation logits held at once: 128 MiB
@@ -24,6 +26,14 @@ METRICS: tuple[str, ...] = (
     "termination_loss",
     "gradient_norm",
 )  # names of what `update` returns
+TURN_METRICS: tuple[str, ...] = (
+    "player_loss",
+    "player_accuracy",
+    "legal_loss",
+    "legal_accuracy",
+    "chance_loss",
+    "chance_excess",
+)  # in a two-player game besides
 
 
 @struct.dataclass
@@ -36,6 +46,7 @@ class Sequences:
       reward_BT: float32; what it earned.
       terminated_BT: bool; the episode ended there, and frame t + 1 belongs to the next one.
       ended_BT: bool; terminated or truncated; None: terminated. Only `mask_after_done` looks at it.
+      turn_BT: whose turn it is at each of the T + 1 frames; None for single-agent tasks.
     """
 
     tokens_BTL: jax.Array
@@ -43,6 +54,7 @@ class Sequences:
     reward_BT: jax.Array
     terminated_BT: jax.Array
     ended_BT: jax.Array | None = None
+    turn_BT: Turn | None = None
 
 
 @struct.dataclass
@@ -60,6 +72,11 @@ def make_optimizer(config: WorldModelConfig) -> optax.GradientTransformation:
     )
 
 
+def metrics_of(spec: TokenSpec) -> tuple[str, ...]:
+    """Names of the scalars that `update` returns for such a stream."""
+    return METRICS + TURN_METRICS if spec.two_player else METRICS
+
+
 def losses(
     model: WorldModel,
     sequences: Sequences,
@@ -69,8 +86,9 @@ def losses(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The sum of three cross-entropies in nats, means over tokens or steps, and scalar metrics.
 
-    Observation + `reward_weight` * (reward + termination). Sequences may cross episodes; with `mask_after_done` only
-    what comes before an episode's end counts: all three losses up to it, but not the tokens it leads to.
+    Observation + `reward_weight` * (reward + termination); in a game + `turn_losses`. Sequences may cross episodes;
+    with `mask_after_done` only what comes before an episode's end counts: all three losses up to it, but not the
+    tokens, nor the turn, it leads to.
     """
     frame, following = sequences.tokens_BTL[:, :-1], sequences.tokens_BTL[:, 1:]
     hidden_BTSD = model(frame, sequences.action_BT, dropout_key)
@@ -79,7 +97,9 @@ def losses(
     token_weight_BTL = jnp.broadcast_to(token_weight_BT[..., None], following.shape)
 
     reward_class_BT = spec.reward_to_class(sequences.reward_BT)
-    reward_loss_BT, reward_correct_BT = cross_entropy(model.reward_logits(hidden_BTSD), reward_class_BT)
+    turn_BT = sequences.turn_BT
+    reward_logits_BTR = model.reward_logits(hidden_BTSD, None if turn_BT is None else turn_BT.seat[:, :-1])
+    reward_loss_BT, reward_correct_BT = cross_entropy(reward_logits_BTR, reward_class_BT)
     termination_loss_BT, _ = cross_entropy(
         model.termination_logits(hidden_BTSD), sequences.terminated_BT.astype(jnp.int32)
     )
@@ -92,7 +112,40 @@ def losses(
         "termination_loss": _mean(termination_loss_BT, step_weight_BT),
     }
     other = metrics["reward_loss"] + metrics["termination_loss"]
-    return metrics["observation_loss"] + config.reward_weight * other, metrics
+    loss = metrics["observation_loss"] + config.reward_weight * other
+    if turn_BT is not None:
+        following_turn_BT = jax.tree.map(lambda x: x[:, 1:], turn_BT)
+        turn_loss, turn_metrics = turn_losses(model.turn_logits(hidden_BTSD), following_turn_BT, token_weight_BT)
+        loss, metrics = loss + turn_loss, metrics | turn_metrics
+    return loss, metrics
+
+
+def turn_losses(logits_BT: TurnLogits, turn_BT: Turn, weight_BT: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """The sum of a game's three further cross-entropies in nats (Appendix G, losses 4 to 6), and scalar metrics.
+
+    Next player; its legal actions, a mean over one binary cross-entropy for each, where a player acts; and chance's
+    probabilities where chance acts, of which `chance_excess` is what is above their entropy: 0 when they are known.
+    """
+    player_loss_BT, player_correct_BT = cross_entropy(logits_BT.player, turn_BT.player)
+    chance_BT = (turn_BT.player == CHANCE).astype(jnp.float32) * weight_BT
+    played_BT = weight_BT - chance_BT
+    legal_loss_BT = optax.sigmoid_binary_cross_entropy(logits_BT.legal, turn_BT.legal_A.astype(jnp.float32)).mean(-1)
+    legal_correct_BT = ((logits_BT.legal > 0) == turn_BT.legal_A).all(-1).astype(jnp.float32)
+    metrics = {
+        "player_loss": _mean(player_loss_BT, weight_BT),
+        "player_accuracy": _mean(player_correct_BT, weight_BT),
+        "legal_loss": _mean(legal_loss_BT, played_BT),
+        "legal_accuracy": _mean(legal_correct_BT, played_BT),
+    }
+    none = jnp.zeros((), jnp.float32)
+    metrics |= {"chance_loss": none, "chance_excess": none}
+    if turn_BT.chance_C.shape[-1]:
+        target_BTC = turn_BT.chance_C
+        chance_loss_BT = -(target_BTC * jax.nn.log_softmax(logits_BT.chance)).sum(-1)
+        entropy_BT = jax.scipy.special.entr(target_BTC).sum(-1)
+        metrics["chance_loss"] = _mean(chance_loss_BT, chance_BT)
+        metrics["chance_excess"] = _mean(chance_loss_BT - entropy_BT, chance_BT)
+    return metrics["player_loss"] + metrics["legal_loss"] + metrics["chance_loss"], metrics
 
 
 def update(

@@ -1,6 +1,7 @@
 """The transformer world model: a GPT-2 over a stream of blocks [q_1 .. q_L, a] (Section 3.6, Appendix A.2.2).
 
-With block teacher forcing the output at q_t^i predicts q_{t+1}^i; the output at a_t predicts reward and termination.
+With block teacher forcing the output at q_t^i predicts q_{t+1}^i; the output at a_t predicts reward and termination,
+and in a two-player game who is next, what is then legal, and the probabilities of chance (Section 4.7, Appendix G).
 Shapes: B streams, T time steps, L tokens per frame, S = L + 1 tokens per block, D width, N heads, H = D / N.
 """
 
@@ -17,7 +18,7 @@ from suite.config import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.world_model.attention import block_causal_attention, block_positions, cached_attention, rope
 from suite.world_model.dropout import dropout
-from suite.world_model.heads import Head, initializer
+from suite.world_model.heads import Head, TurnHead, TurnLogits
 
 TERMINATION_CLASSES = 2
 
@@ -43,7 +44,9 @@ class Block(nnx.Module):
         width = config.embed_dim
 
         def dense(inputs: int, outputs: int) -> nnx.Linear:
-            return nnx.Linear(inputs, outputs, dtype=dtype, kernel_init=initializer(), rngs=rngs)
+            return nnx.Linear(
+                inputs, outputs, dtype=dtype, kernel_init=nnx.initializers.normal(config.initial_std), rngs=rngs
+            )
 
         self.heads, self.rate = config.heads, config.dropout
         self.attention_norm = layer_norm(width, rngs)
@@ -91,13 +94,18 @@ class WorldModel(nnx.Module):
         self.config, self.grid = config, grid
         self.block = tokens.tokens_per_frame + 1
         self.dtype = jnp.bfloat16 if config.compute_type == "bfloat16" else jnp.float32
-        self.token_embedding = nnx.Embed(tokens.num_codes, width, embedding_init=initializer(), rngs=rngs)
-        self.action_embedding = nnx.Embed(tokens.num_actions, width, embedding_init=initializer(), rngs=rngs)
+        self.codes_per_place = tokens.num_codes if tokens.placed else 0
+        codes = tokens.num_codes * (tokens.tokens_per_frame if tokens.placed else 1)
+        init = nnx.initializers.normal(config.initial_std)
+        self.token_embedding = nnx.Embed(codes, width, embedding_init=init, rngs=rngs)
+        self.action_embedding = nnx.Embed(tokens.num_actions, width, embedding_init=init, rngs=rngs)
         self.layers = _stacked_layers(config, self.dtype, rngs)
         self.norm = layer_norm(width, rngs)
-        self.observation_head = Head(width, tokens.num_codes, self.dtype, rngs)
-        self.reward_head = Head(width, len(tokens.reward_classes), self.dtype, rngs)
-        self.termination_head = Head(width, TERMINATION_CLASSES, self.dtype, rngs)
+        self.observation_head = Head(config, tokens.num_codes, self.dtype, rngs)
+        self.seats = 2 if tokens.two_player else 1
+        self.reward_head = Head(config, self.seats * len(tokens.reward_classes), self.dtype, rngs)
+        self.termination_head = Head(config, TERMINATION_CLASSES, self.dtype, rngs)
+        self.turn_head = TurnHead(config, tokens, self.dtype, rngs) if tokens.two_player else None
 
     def __call__(self, tokens_BTL: jax.Array, action_BT: jax.Array, dropout_key: jax.Array | None = None) -> jax.Array:
         """Hidden states [B, T, S, D] (float32) of whole sequences; without `dropout_key` nothing is dropped."""
@@ -133,13 +141,25 @@ class WorldModel(nnx.Module):
         """float32 [B, T, L, K]: of q_{t+1} at each q_t, from hidden states [B, T, S, D] (or without the T axis)."""
         return self.observation_head(hidden[..., :-1, :])
 
-    def reward_logits(self, hidden: jax.Array) -> jax.Array:
-        """float32 [B, T, R]: of the reward's class, from hidden states [B, T, S, D] (or without the T axis)."""
-        return self.reward_head(hidden[..., -1, :])
+    def reward_logits(self, hidden: jax.Array, seat: jax.Array | None = None) -> jax.Array:
+        """float32 [B, T, R]: of the reward's class, from hidden states [B, T, S, D] (or without the T axis).
+
+        In a game, of the reward of player `seat` (int32 [B, T]): the stream itself does not say which of them is ours.
+        """
+        logits = self.reward_head(hidden[..., -1, :])
+        if seat is None:
+            return logits
+        first, second = jnp.split(logits, self.seats, axis=-1)
+        return jnp.where((seat == 1)[..., None], first, second)
 
     def termination_logits(self, hidden: jax.Array) -> jax.Array:
         """float32 [B, T, 2]: (goes on, terminated), from hidden states [B, T, S, D] (or without the T axis)."""
         return self.termination_head(hidden[..., -1, :])
+
+    def turn_logits(self, hidden: jax.Array) -> TurnLogits:
+        """Of a game's next turn, from hidden states [B, T, S, D] (or without the T axis)."""
+        assert self.turn_head is not None
+        return self.turn_head(hidden[..., -1, :])
 
     def init_cache(self, batch: int, length: int) -> Cache:
         """An empty cache for `length` steps of `batch` streams."""
@@ -171,6 +191,9 @@ class WorldModel(nnx.Module):
         return Cache(keys, values, cache.index + 1), self.norm(x)
 
     def _embed(self, tokens: jax.Array, action: jax.Array) -> jax.Array:
+        if self.codes_per_place:
+            places = self.codes_per_place * jnp.arange(tokens.shape[-1])
+            tokens = tokens + places.reshape((1,) * (tokens.ndim - 1) + (-1,))
         return jnp.concatenate([self.token_embedding(tokens), self.action_embedding(action)[..., None, :]], axis=-2)
 
 

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from suite.interface.tokens import TokenSpec
+from suite.interface.tokens import TokenSpec, decode_frame, encode_frame
+from suite.interface.turns import Turn
 
 
 def spec_of(levels):
@@ -43,3 +44,25 @@ def test_classes_and_levels_are_inverse():
     assert rewards.dtype == jnp.float32 and rewards.shape == (5, 1)
     assert rewards.ravel().tolist() == [0, 1, 3, 5, 8]
     np.testing.assert_array_equal(spec.reward_to_class(rewards), index)
+
+
+class Identity:
+    encode = decode = staticmethod(lambda state, x: x)
+
+
+@pytest.mark.parametrize("seat", [1, 2])
+def test_a_frame_of_a_game_is_both_observations_player_one_first(seat):
+    ours, theirs = jnp.array([[1, 2, 3]]), jnp.array([[4, 5, 6]])
+    no = jnp.zeros((1, 0))
+    turn = Turn(jnp.array([1]), jnp.array([seat]), no, no, theirs)
+    tokens = encode_frame(Identity(), None, ours, turn)
+    assert tokens.tolist() == ([[1, 2, 3, 4, 5, 6]] if seat == 1 else [[4, 5, 6, 1, 2, 3]])
+    back = decode_frame(Identity(), None, tokens, turn.seat)
+    assert [x.tolist() for x in back] == [ours.tolist(), theirs.tolist()]
+
+
+def test_a_frame_for_one_player_is_its_observation():
+    frame = jnp.array([[1, 2, 3]])
+    assert encode_frame(Identity(), None, frame, None) is frame
+    ours, theirs = decode_frame(Identity(), None, frame, None)
+    assert ours is frame and theirs is None

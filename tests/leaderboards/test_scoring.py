@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from leaderboards import scoring
+from leaderboards.best_response import Reference
 from suite.config import Config, EnvironmentConfig, PPOConfig, ProtocolConfig, ReplayConfig
 from tests.tiny import CORRIDOR_SPEC
 
@@ -74,3 +75,48 @@ def test_no_episode_in_the_last_tenth_leaves_the_score():
     scores = scoring.craftax(episodes(ROWS[:2]), CONFIG, SPEC)
     assert math.isnan(scores["reward_percent"])
     assert scores["score_percent"] == pytest.approx(math.sqrt(51 * 1) - 1)
+
+
+GAME_ROWS = [
+    # step, return, length, raw_return, seat
+    (100, -1.0, 5, -13.0, 1),
+    (900, 1.0, 5, 9.0, 2),  # exactly where the last tenth begins: not in it
+    (901, 1.0, 5, 5.0, 1),
+    (950, -1.0, 5, -2.0, 1),
+    (1000, 1.0, 5, 4.0, 2),
+    (1001, 1.0, 5, 13.0, 2),  # beyond the budget
+]
+
+
+def game_episodes(rows=GAME_ROWS):
+    return pd.DataFrame(rows, columns=["step", "return", "length", "raw_return", "seat"])
+
+
+def test_a_games_return_is_the_mean_of_its_seats():
+    scores = scoring.games(game_episodes(), CONFIG, dataclasses.replace(SPEC, id="openspiel/other"))
+    assert scores == {
+        "return_seat_1": 1.5,
+        "return_seat_2": 4.0,
+        "return": 2.75,
+        "episodes": 5,
+        "final_episodes": 3,
+    }
+
+
+def test_a_games_normalized_return(monkeypatch):
+    monkeypatch.setitem(scoring.REFERENCE, "corridor", Reference(random=(0.5, -1.0), best_response=(2.5, 9.0)))
+    assert scoring.games(game_episodes(), CONFIG, SPEC)["normalized_return"] == pytest.approx((0.5 + 0.5) / 2)
+
+
+def test_a_game_without_a_protocol_counts_all_episodes():
+    scores = scoring.games(game_episodes().to_dict("records"), None, SPEC)
+    assert (scores["episodes"], scores["final_episodes"]) == (6, 6)
+    assert (scores["return_seat_1"], scores["return_seat_2"]) == (pytest.approx(-10 / 3), pytest.approx(26 / 3))
+
+
+@pytest.mark.parametrize("config", [CONFIG, None])
+def test_no_games_are_nan_and_not_an_error(config):
+    for empty in (game_episodes([]), []):
+        scores = scoring.games(empty, config, dataclasses.replace(SPEC, id="openspiel/leduc"))
+        assert scores["episodes"] == scores["final_episodes"] == 0
+        assert all(math.isnan(value) for name, value in scores.items() if "return" in name)

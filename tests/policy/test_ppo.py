@@ -15,6 +15,7 @@ from suite.agent import rollout as play
 from suite.config import PolicyConfig, PPOConfig
 from suite.interface.batching import Batched
 from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
+from suite.interface.turns import Turn
 from suite.policy import ppo
 from suite.policy.actor_critic import log_probability, make_policy, mask_logits
 
@@ -45,35 +46,50 @@ def random_trajectory(seed: int, steps: int = 6, batch: int = 4, *, turns: bool 
         hidden_BH=normal(batch, TINY.rnn_size),
         last_value_B=normal(batch),
         truncation_value_TB=jnp.where(truncated_TB, normal(steps, batch), 0.0),
-        acting_TB=jnp.asarray(rng.random((steps, batch)) < 0.6) if turns else None,
-        legal_TBA=legal_TBA if turns else None,
+        turn_TB=turn_of(jnp.asarray(rng.random((steps, batch)) < 0.6), legal_TBA) if turns else None,
+        last_ours_B=jnp.asarray(rng.random(batch) < 0.5) if turns else None,
     )
 
 
-def reference_advantages(t: ppo.Trajectory, discount: float, gae_lambda: float) -> np.ndarray:
-    """The definition, forwards: each decision looks for the next one of ours in its episode."""
+def turn_of(acting_TB, legal_TBA) -> Turn:
+    """Turns of our player, 1, where `acting_TB`, and of the other elsewhere."""
+    return Turn(
+        player=jnp.where(acting_TB, 1, 2),
+        seat=jnp.ones(acting_TB.shape, jnp.int32),
+        legal_A=legal_TBA,
+        chance_C=jnp.zeros((*acting_TB.shape, 0), jnp.float32),
+        opponent_observation=jnp.zeros((*acting_TB.shape, 3), jnp.uint8),
+    )
+
+
+def reference_advantages(t: ppo.Trajectory, discount: float, gae_lambda: float) -> tuple[np.ndarray, np.ndarray]:
+    """The definition, forwards: each decision looks for the next one of ours in its episode; and where there is one."""
     reward, value, truncation_value = map(np.asarray, (t.reward_TB, t.value_TB, t.truncation_value_TB))
     terminated, truncated = np.asarray(t.terminated_TB), np.asarray(t.truncated_TB)
     steps, batch = reward.shape
     acting = np.ones((steps, batch), bool) if t.acting_TB is None else np.asarray(t.acting_TB)
-    advantage = np.zeros((steps, batch))
+    advantage, known = np.zeros((steps, batch)), np.zeros((steps, batch), bool)
+    last_ours = np.ones(batch, bool) if t.last_ours_B is None else np.asarray(t.last_ours_B)
 
     def advantage_at(i, b):
         total = 0.0
         for j in range(i, steps):
             if j > i and acting[j, b]:  # the next decision; everything in between was someone else's
                 error = total + discount * value[j, b] - value[i, b]
-                return error + discount * gae_lambda * advantage_at(j, b)
+                beyond = advantage_at(j, b)
+                return error + (0.0 if beyond is None else discount * gae_lambda * beyond)
             total += reward[j, b]
             if terminated[j, b]:
                 return total - value[i, b]
             if truncated[j, b]:
                 return total + discount * truncation_value[j, b] - value[i, b]
-        return total + discount * float(t.last_value_B[b]) - value[i, b]
+        return total + discount * float(t.last_value_B[b]) - value[i, b] if last_ours[b] else None
 
     for i, b in np.argwhere(acting):
-        advantage[i, b] = advantage_at(i, b)
-    return advantage
+        value_at = advantage_at(i, b)
+        known[i, b] = value_at is not None
+        advantage[i, b] = value_at or 0.0
+    return advantage, known
 
 
 @pytest.mark.parametrize("turns", [False, True])
@@ -82,8 +98,13 @@ def test_generalized_advantages_against_the_definition(turns):
     for seed in range(60):
         t = random_trajectory(seed, turns=turns)
         discount, gae_lambda = np.random.default_rng(seed).uniform(0, 1, 2)
-        expected = reference_advantages(t, discount, gae_lambda)
-        np.testing.assert_allclose(advantages(t, discount, gae_lambda), expected, rtol=1e-4, atol=1e-5)
+        advantage_TB, known_TB = advantages(t, discount, gae_lambda)
+        expected, known = reference_advantages(t, discount, gae_lambda)
+        np.testing.assert_allclose(advantage_TB, expected, rtol=1e-4, atol=1e-5)
+        if turns:
+            np.testing.assert_array_equal(known_TB, known)
+        else:
+            assert known_TB is None and known.all()
 
 
 def test_advantage_by_hand():
@@ -97,7 +118,7 @@ def test_advantage_by_hand():
         terminated_TB=no,
         truncated_TB=no,
     )
-    np.testing.assert_allclose(ppo.generalized_advantages(t, 0.5, 0.5)[:, 0], [-1.75, 3.0])
+    np.testing.assert_allclose(ppo.generalized_advantages(t, 0.5, 0.5)[0][:, 0], [-1.75, 3.0])
 
 
 def test_target_statistics_against_numpy():
@@ -139,7 +160,7 @@ def setup(config: PPOConfig, seed: int = 0):
     network = nnx.jit(lambda: make_policy(TINY, SYMBOLS, ACTIONS, nnx.Rngs(seed)))()
     network.policy_head.kernel[...] = 30.0 * network.policy_head.kernel[...]  # something to disagree with
     graphdef, params = nnx.split(network)
-    optimizer = ppo.make_optimizer(config, None)
+    optimizer = ppo.make_optimizer(config)
     return graphdef, optimizer, ppo.Learner.create(config, optimizer, params)
 
 
@@ -178,19 +199,19 @@ def test_first_minibatch_has_ratio_one(turns):
     assert metrics["approx_kl"] == pytest.approx(0.0, abs=1e-6)
     assert metrics["policy_loss"] == pytest.approx(0.0, abs=1e-5)  # minus the mean of standardized advantages
     fast = PPOConfig(learning_rate=0.1)
-    _, later = run(fast, graphdef, ppo.make_optimizer(fast, None), learner, t, epochs=4)
+    _, later = run(fast, graphdef, ppo.make_optimizer(fast), learner, t, epochs=4)
     assert later["approx_kl"] > 1e-3 and later["clip_fraction"] > 0.0
 
 
 def reference_loss(config: PPOConfig, graphdef, learner, t: ppo.Trajectory, entropy_coefficient: float) -> dict:
     """The losses of one minibatch that is the whole batch, in NumPy."""
     output, _ = nnx.merge(graphdef, learner.params)(t.observation_TB, t.first_TB, t.hidden_BH, t.acting_TB)
-    mask = np.ones(t.action_TB.shape, bool) if t.acting_TB is None else np.asarray(t.acting_TB)
+    advantage, mask = reference_advantages(t, config.discount, config.gae_lambda)
     legal = np.ones((*mask.shape, ACTIONS), bool) if t.legal_TBA is None else np.asarray(t.legal_TBA)
     logits = np.where(legal, np.asarray(output.logits_TBA), -np.inf)
     policy = np.exp(logits - logits.max(-1, keepdims=True))
     policy /= policy.sum(-1, keepdims=True)
-    advantage = reference_advantages(t, config.discount, config.gae_lambda)[mask]
+    advantage = advantage[mask]
     target = advantage + np.asarray(t.value_TB)[mask]
     target = (target - target.mean()) / max(target.std(), config.target_min_std)  # the first update: no history
     advantage = (advantage - advantage.mean()) / advantage.std()
@@ -233,7 +254,7 @@ def test_events_of_others_teach_nothing():
         action_TB=jnp.where(theirs, ACTIONS + 2, t.action_TB),
         log_probability_TB=jnp.where(theirs, -500.0, t.log_probability_TB),
         value_TB=jnp.where(theirs, 99.0, t.value_TB),
-        legal_TBA=t.legal_TBA & t.acting_TB[..., None],
+        turn_TB=t.turn_TB.replace(legal_A=t.legal_TBA & t.acting_TB[..., None]),
         observation_TB=jnp.where(theirs[..., None], jnp.uint8(0), t.observation_TB),
     )
     results = [run(config, graphdef, optimizer, learner, x, epochs=2, minibatches=2) for x in (t, other)]
@@ -248,7 +269,8 @@ def test_a_batch_without_our_decisions_is_finite():
     config = PPOConfig()
     graphdef, optimizer, learner = setup(config)
     t = random_trajectory(5, turns=True)
-    after, metrics = run(config, graphdef, optimizer, learner, t.replace(acting_TB=jnp.zeros_like(t.acting_TB)))
+    nobody = t.replace(turn_TB=t.turn_TB.replace(seat=jnp.zeros_like(t.turn_TB.seat)))
+    after, metrics = run(config, graphdef, optimizer, learner, nobody)
     assert all(jnp.isfinite(value) for value in metrics.values())
     assert changed(after.params, learner.params) == 0.0
 
@@ -306,15 +328,36 @@ def test_gradients_are_clipped_by_their_global_norm():
 def test_learning_rate_falls_linearly_to_zero(anneal):
     """Fidelity note 11. Adam on a constant gradient moves by the rate itself."""
     config = PPOConfig()
-    optimizer = ppo.make_optimizer(config, 4 if anneal else None)
-    params = {"x": jnp.zeros(())}
-    state, moves = optimizer.init(params), []
-    for _ in range(5):
-        with jax.numpy_dtype_promotion("standard"):
-            change, state = optimizer.update({"x": jnp.float32(0.3)}, state, params)
-        moves.append(-float(change["x"]))
-    fractions = [1, 0.75, 0.5, 0.25, 0] if anneal else [1] * 5
-    np.testing.assert_allclose(moves, 4.5e-4 * np.array(fractions), rtol=1e-3, atol=1e-12)
+    graphdef, optimizer, learner = setup(config)
+    t = random_trajectory(0)
+
+    def moved(share: float) -> float:
+        """How far one minibatch moves the parameters when `share` of the budget is left, none of it afterwards."""
+        remaining = (jnp.float32(share), jnp.float32(0)) if anneal else None
+        plan = {"epochs": 1, "minibatches": 1, "entropy_coefficient": 0.0, "remaining": remaining}
+        after, _ = ppo.update(config, optimizer, graphdef, learner, t, **plan)
+        return changed(after.params, learner.params)
+
+    full = moved(1.0)
+    shares = [0.75, 0.25, 0.0] if anneal else [1.0]
+    np.testing.assert_allclose([moved(share) / full for share in shares], shares, rtol=1e-3, atol=1e-6)
+
+
+def test_learning_rate_falls_between_minibatches():
+    """Two minibatches of equal halves from a share of 1 to 0: rates 1 and 0.5, so the second adds half of its own."""
+    config = PPOConfig()
+    graphdef, optimizer, learner = setup(config)
+    t = random_trajectory(0)
+
+    def after(last: float, minibatches: int) -> ppo.Learner:
+        remaining = (jnp.float32(1), jnp.float32(last))
+        plan = {"epochs": 1, "minibatches": minibatches, "entropy_coefficient": 0.0, "remaining": remaining}
+        return ppo.update(config, optimizer, graphdef, learner, t, **plan)[0]
+
+    steady, falling = after(1.0, 2), after(0.0, 2)
+    first_only = after(-1.0, 2)  # rates 1 and 0
+    halved = jax.tree.map(lambda a, b: (a + b) / 2, steady.params, first_only.params)
+    assert changed(falling.params, halved) < 1e-5 < changed(steady.params, first_only.params)
 
 
 def test_acting_needs_no_optimizer():
@@ -373,7 +416,7 @@ def learn_cue(rnn_size: int, iterations: int = 60) -> float:
     policy_config = PolicyConfig(hidden_size=32, rnn_size=rnn_size, dense_blocks=1)
     new_policy = functools.partial(make_policy, policy_config, environment.spec.observation, 2)
     graphdef, params = nnx.split(nnx.jit(lambda: new_policy(nnx.Rngs(0)))())
-    optimizer = ppo.make_optimizer(config, None)
+    optimizer = ppo.make_optimizer(config)
 
     def iteration(carry, key):
         learner, player = carry
