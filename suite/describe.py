@@ -22,7 +22,7 @@ from suite.policy.actor_critic import make_policy
 from suite.registry import Source
 from suite.world_model.transformer import WorldModel
 
-MORE = ", if chance never acted: its events do not count as steps"
+MORE = "; more, as chance's events do not count"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -101,7 +101,45 @@ def test_a_broken_entry_point_is_named(monkeypatch, load, message):
 def test_a_task_without_the_default_preset(monkeypatch):
     import dataclasses
 
-    entry = registry.TASKS[0]
+    entry = registry.task("craftax_classic")
     entry = dataclasses.replace(entry, presets={"smoke": entry.presets["smoke"]})
     monkeypatch.setattr(registry, "TASKS", (entry,))
     assert registry.resolve("craftax_classic").preset == "smoke"
+
+
+@pytest.mark.parametrize("id", ["openspiel/kuhn_poker", "gymnasium/FrozenLake-v1", "pettingzoo/connect_four_v3"])
+def test_a_family_has_more_tasks_than_are_listed(id):
+    entry = registry.task(id)
+    assert id not in registry.tasks()
+    assert entry.id == entry.spec().id == id
+    for lazy in (entry.make, entry.scores, *entry.presets.values()):
+        assert callable(lazy())
+    assert registry.resolve(id, preset="small").task == id
+
+
+@pytest.mark.parametrize(
+    ("id", "message"),
+    [
+        ("openspiel/leduk", "leduc"),
+        ("openspiel/", "unknown task 'openspiel/'"),
+        ("gymnasium/FrozenLak-v1", "FrozenLake"),
+        ("pettingzoo/connect_five_v3", "connect_four"),
+        ("minatari/breakout", "unknown task 'minatari/breakout'"),
+    ],
+)
+def test_a_wrong_name_in_a_family_is_one_line(id, message):
+    with pytest.raises(UserError, match=message) as caught:
+        registry.resolve(id)
+    assert "\n" not in str(caught.value)
+
+
+def test_presets_of_the_games():
+    """The paper's table for OpenSpiel, and fidelity note 6: a memory only where something is hidden."""
+    config = registry.resolve("openspiel/leduc", "m5", "paper")
+    assert (config.protocol.steps, config.imagination.start_step) == (100_000, 0)
+    assert (config.world_model.updates, config.imagination.updates) == (2_000, 2_000)
+    assert config.imagination.entropy_coefficient == 0.05 and config.ppo.entropy_coefficient == 0.01
+    assert config.world_model.reward_weight == 1.0 and config.policy.shared_trunk
+    assert (config.ppo.discount, config.ppo.gae_lambda, config.ppo.target_decay) == (0.925, 0.625, 0.95)
+    assert config.policy.rnn_size == 256
+    assert registry.resolve("openspiel/tic_tac_toe", "m5", "paper").policy.rnn_size == 0

@@ -78,6 +78,8 @@ MODEL_NOTES = {
     "world_model.enabled": True,
     "world_model.positions": "flat",  # 20
     "world_model.mask_after_done": False,  # 21
+    "world_model.symbol_places": True,  # games only
+    "world_model.initial_std": 0.02,  # GPT-2's
     "world_model.reward_classes": None,  # the task's levels: 22
     "world_model.sequences": 48,
     "world_model.reward_weight": 1.0,  # 23
