@@ -96,7 +96,8 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
     run.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where records go (default runs)")
     run.add_argument("--resume", action="store_true", help="fail if there is no run to go on with")
     commands["list"].add_argument("what", metavar="tasks|agents|presets")
-    commands["evaluate"].add_argument("folder", type=Path, metavar="RUN_DIR")
+    commands["evaluate"].add_argument("what", metavar="RUN_DIR|TASK", help="a run's folder, or with --policy a task")
+    commands["evaluate"].add_argument("--policy", metavar="module:Class", help="somebody else's policy")
     commands["evaluate"].add_argument("--episodes", type=int, metavar="N", help="at least so many")
     for name in ("run", "evaluate", "bench"):
         commands[name].add_argument("--quiet", action="store_true", help="no progress")
@@ -224,19 +225,31 @@ def _describe(args: argparse.Namespace) -> int:
 
 
 def _evaluate(args: argparse.Namespace) -> int:
+    from suite import registry
     from suite.record import RunRecord
 
     if args.episodes is not None and args.episodes < 1:
         raise UserError(f"--episodes={args.episodes}: must be at least 1")
-    RunRecord.open(args.folder, lock=False)
+    if args.policy:
+        from suite.external import evaluate_policy
+
+        scores = evaluate_policy(args.what, args.policy, args.episodes, _reporter(args.quiet))
+        _print_scores(scores)
+        if args.json:
+            _print_json({"task": args.what, "policy": args.policy, **scores})
+        return 0
+    folder = Path(args.what)
+    if not folder.exists() and args.what in registry.tasks():
+        raise UserError(f"{args.what} is a task: say whose policy to play it with, --policy module:Class")
+    RunRecord.open(folder, lock=False)
 
     from suite import evaluation
 
-    scores = evaluation.evaluate(args.folder, args.episodes, _reporter(args.quiet))
+    scores = evaluation.evaluate(folder, args.episodes, _reporter(args.quiet))
     _print_scores(scores)
-    print(f"record {args.folder}")
+    print(f"record {folder}")
     if args.json:
-        _print_json({"folder": str(args.folder), **scores})
+        _print_json({"folder": str(folder), **scores})
     return 0
 
 

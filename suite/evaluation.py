@@ -52,11 +52,11 @@ def episode_rows(
     return rows, int(log.counts_TB.sum())
 
 
-def play_episodes(agent: Agent, learner: Learner, key: jax.Array, episodes: int) -> list[dict[str, Any]]:
+def play_episodes(agent: Any, learner: Learner | None, key: jax.Array, episodes: int) -> list[dict[str, Any]]:
     """At least `episodes` whole episodes: the first of each of N_env environments, as often as it takes.
 
     Taking each environment's first episode, however long, keeps short episodes from being over-counted. Rows have
-    `step` counted from the start of the evaluation.
+    `step` counted from the start of the evaluation. Of `agent` only `start`, `collect`, `batched` and `spec` are used.
     """
     rows: list[dict[str, Any]] = []
     while len(rows) < episodes:
