@@ -25,7 +25,7 @@ def test_a_model_that_knows_the_rules_and_one_that_knows_nothing():
 
     fresh = agent.init(jax.random.key(5)).world_model.params
     broken = rules_kept(agent, fresh, state.tokenizer, jax.random.key(0), plays=200)
-    assert broken["legal_percent"] < 90 and broken["player_percent"] < 70
+    assert broken["legal_percent"] < 95 and broken["player_percent"] < 70
     assert broken["observations_percent"] < 50
 
 
