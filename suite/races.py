@@ -22,6 +22,7 @@ from suite.compilation import enable_compilation_cache
 from suite.config import Config
 from suite.interface.batching import Batched
 from suite.interface.environment import BatchedEnvironment, Environment
+from suite.interface.turns import choose_event
 from suite.world_model.transformer import WorldModel
 
 Table = list[dict[str, Any]]
@@ -71,7 +72,7 @@ class NoReset:
         return self.environment.spec
 
     def reset(self, key: jax.Array) -> Any:
-        return jax.vmap(self.environment.reset)(jax.random.split(key, self.num_envs))
+        return Batched(self.environment, self.num_envs).reset(key)
 
     def step(self, key: jax.Array, state: Any, action_B: jax.Array) -> Any:
         return jax.vmap(self.environment.step)(jax.random.split(key, self.num_envs), state, action_B)
@@ -80,19 +81,25 @@ class NoReset:
 def _player_of(environment: BatchedEnvironment, num_actions: int) -> Callable[[], None]:
     """A compiled and warmed-up call that plays `RACE_STEPS` random steps and goes on from there the next time."""
 
-    def step(state, key):
+    def act(key, turn):
+        if turn is None:
+            return jax.random.randint(key, (environment.num_envs,), 0, num_actions)
+        # In a game everybody is the opponent, who plays uniformly among what is legal; and chance.
+        nobody = dataclasses.replace(turn, seat=jnp.zeros_like(turn.seat) - 1)
+        return choose_event(key, nobody, jnp.zeros_like(turn.player))
+
+    def step(carry, key):
+        state, turn = carry
         action_key, step_key = jax.random.split(key)
-        action_B = jax.random.randint(action_key, (environment.num_envs,), 0, num_actions)
-        state, time_step = environment.step(step_key, state, action_B)
-        return state, (time_step.observation, time_step.reward, time_step.terminated)
+        state, time_step = environment.step(step_key, state, act(action_key, turn))
+        return (state, time_step.turn), (time_step.observation, time_step.reward, time_step.terminated)
 
     @jax.jit
-    def play(state, key):
-        state, seen = jax.lax.scan(step, state, jax.random.split(key, RACE_STEPS))
-        return state, seen
+    def play(carry, key):
+        return jax.lax.scan(step, carry, jax.random.split(key, RACE_STEPS))
 
-    state, _ = jax.jit(environment.reset)(jax.random.key(0))
-    holder = [state, jax.random.key(1)]
+    state, time_step = jax.jit(environment.reset)(jax.random.key(0))
+    holder = [(state, time_step.turn), jax.random.key(1)]
 
     def go_on() -> None:
         holder[1], key = jax.random.split(holder[1])
