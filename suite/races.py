@@ -99,7 +99,7 @@ def _player_of(environment: BatchedEnvironment, num_actions: int) -> Callable[[]
         return jax.lax.scan(step, carry, jax.random.split(key, RACE_STEPS))
 
     state, time_step = jax.jit(environment.reset)(jax.random.key(0))
-    holder = [(state, time_step.turn), jax.random.key(1)]
+    holder: list[Any] = [(state, time_step.turn), jax.random.key(1)]
 
     def go_on() -> None:
         holder[1], key = jax.random.split(holder[1])
