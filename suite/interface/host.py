@@ -82,7 +82,7 @@ class HostEnvironment:
     """A host engine as an `Environment`: works under jit, vmap and loops; a batch is one call to the host.
 
     Args:
-      spec: what the task is.
+      spec: what the task is; of statistics, only a game's "seat" can be given.
       make_engine: makes one engine; called as often as engines are needed side by side.
       limit: an episode of so many steps is truncated, unless it ended by itself.
     """
@@ -123,6 +123,7 @@ class HostEnvironment:
             self._visit, self._result, state.seed, state.actions, state.length, vmap_method="broadcast_all"
         )
         observation, reward, turn = shown.observation, shown.reward, None
+        names = [name for name, _ in self.spec.statistics]
         if state.seat is not None:
             turn = Turn(
                 player=shown.player,
@@ -139,7 +140,7 @@ class HostEnvironment:
             truncated=(shown.truncated | (state.length >= self.limit)) & ~shown.terminated,
             first=first,
             final_observation=observation,
-            statistics={} if state.seat is None else {"seat": state.seat.astype(jnp.float32)},
+            statistics={} if state.seat is None else dict.fromkeys(names, state.seat.astype(jnp.float32)),
             turn=turn,
         )
 
