@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adapters.game_tables import Tables
+if TYPE_CHECKING:  # scoring needs `REFERENCE` only, and no adapter
+    from adapters.game_tables import Tables
 
 
 @dataclasses.dataclass(frozen=True)
