@@ -3,6 +3,6 @@
 Importing this package tells Gymnasium of every single-agent task; it builds no game and imports no JAX.
 """
 
-from adapters.gymnasium_bridge import register_all
+from adapters.gymnasium_export import register_all
 
 register_all()

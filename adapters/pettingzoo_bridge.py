@@ -73,7 +73,7 @@ class SuiteAECEnv(pettingzoo.AECEnv):
         environment: Any = _built(task) if isinstance(task, str) else task
         spec = environment.spec
         if not spec.two_player:
-            raise UserError(f"{spec.id} has one player: it is a Gymnasium environment (adapters.gymnasium_bridge)")
+            raise UserError(f"{spec.id} has one player: it is a Gymnasium environment (adapters.gymnasium_export)")
         if render_mode not in (None, "ansi"):
             raise UserError(f"{spec.id} cannot be rendered as {render_mode!r}; valid: ansi")
         self.metadata = {

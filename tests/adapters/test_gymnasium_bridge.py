@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from adapters import gymnasium_bridge, register_all
+from adapters import gymnasium_bridge, gymnasium_export, register_all
 from suite import registry
 from suite.errors import UserError
 from suite.interface.batching import Batched
@@ -20,7 +20,7 @@ from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeSt
 from tests.contract import check_environment, check_spec, check_types
 from tests.tiny import CORRIDOR, Corridor, Pennies
 
-EXPORTED = sorted(id for id, task in registry.tasks().items() if task.family not in gymnasium_bridge.NOT_EXPORTED)
+EXPORTED = sorted(id for id, task in registry.tasks().items() if task.family not in gymnasium_export.NOT_EXPORTED)
 MINIGRID = pytest.param("MiniGrid-Empty-5x5-v0", marks=pytest.mark.skipif("not has_minigrid()"))
 
 
@@ -80,7 +80,7 @@ def test_check_env_of_a_tiny_task(corridor):
 
 def test_single_plays_the_environment_by_its_seed(corridor):
     environment = Corridor()
-    env = gymnasium_bridge.SuiteEnv(environment)
+    env = gymnasium_export.SuiteEnv(environment)
     observation, info = env.reset(seed=5)
     key, reset_key = jax.random.split(jax.random.key(5))
     state, shown = environment.reset(reset_key)
@@ -175,7 +175,7 @@ def test_vector_wrappers_count_episodes(corridor):
 
 
 def test_symbols_are_multi_discrete():
-    env = gymnasium_bridge.SuiteEnv(Symbols())
+    env = gymnasium_export.SuiteEnv(Symbols())
     assert env.observation_space == spaces.MultiDiscrete([256, 256])
     observation, _ = env.reset(seed=0)
     assert env.observation_space.contains(observation)
@@ -192,19 +192,19 @@ def test_render_is_the_observation():
         frame,
         {},
     )
-    env = gymnasium_bridge.SuiteEnv(environment, render_mode="rgb_array")
+    env = gymnasium_export.SuiteEnv(environment, render_mode="rgb_array")
     observation, _ = env.reset(seed=0)
     np.testing.assert_array_equal(env.render(), observation)
 
 
 def test_misuse_is_one_error():
-    env = gymnasium_bridge.SuiteEnv(Corridor())
+    env = gymnasium_export.SuiteEnv(Corridor())
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(0)
     env.reset()
     with pytest.raises(gymnasium.error.InvalidAction, match="2 is no action"):
         env.step(2)
-    envs = gymnasium_bridge.SuiteVectorEnv(Corridor(), 2)
+    envs = gymnasium_export.SuiteVectorEnv(Corridor(), 2)
     with pytest.raises(gymnasium.error.ResetNeeded):
         envs.step([0, 0])
     with pytest.raises(UserError, match="one seed"):
@@ -215,11 +215,11 @@ def test_misuse_is_one_error():
     with pytest.raises(gymnasium.error.InvalidAction):
         envs.step([0, 2])
     with pytest.raises(UserError, match="cannot be rendered"):
-        gymnasium_bridge.SuiteEnv(Corridor(), render_mode="rgb_array")
+        gymnasium_export.SuiteEnv(Corridor(), render_mode="rgb_array")
     with pytest.raises(UserError, match="game of two players"):
-        gymnasium_bridge.SuiteEnv(Pennies())
+        gymnasium_export.SuiteEnv(Pennies())
     with pytest.raises(UserError, match="unknown task"):
-        gymnasium_bridge.SuiteEnv("nethack")
+        gymnasium_export.SuiteEnv("nethack")
 
 
 # In.
@@ -277,7 +277,7 @@ def test_imported_contract(id):
 
 
 def test_imported_is_exported_again():
-    env = gymnasium_bridge.SuiteEnv(gymnasium_bridge.make("FrozenLake-v1"))
+    env = gymnasium_export.SuiteEnv(gymnasium_bridge.make("FrozenLake-v1"))
     env.reset(seed=0)
     assert env.observation_space == spaces.MultiDiscrete([16])
     assert env.step(1)[1:4] == (0.0, False, False)
