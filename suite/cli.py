@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from suite.reporting import Reporter
     from suite.run import Result
 
-COMMANDS = ("run", "list", "describe", "evaluate", "bench")
+COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "bench")
 LISTS = ("tasks", "agents", "presets")
 BAD_INPUT, FAILED, STOPPED = 2, 1, 130
 
@@ -67,8 +67,8 @@ def _dispatch(argv: list[str]) -> int:
         raise UserError(f"unexpected argument {rest[0]!r}")
     if rest:
         args.overrides = [*args.overrides, *rest]
-    command = {"run": _run, "list": _list, "describe": _describe, "evaluate": _evaluate, "bench": _bench}[args.command]
-    return command(args)
+    functions = (_run, _list, _describe, _evaluate, _inspect, _bench)
+    return dict(zip(COMMANDS, functions, strict=True))[args.command](args)
 
 
 def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
@@ -81,6 +81,7 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
         "list": "tasks, agents or presets, one line each",
         "describe": "the whole configuration, layers and parameter counts, without running anything",
         "evaluate": "play whole episodes with a run's newest checkpoint",
+        "inspect": "how well the world models of two-player games keep the rules",
         "bench": "time, share and speed of each phase",
     }
     commands = {
@@ -99,7 +100,9 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
     commands["evaluate"].add_argument("what", metavar="RUN_DIR|TASK", help="a run's folder, or with --policy a task")
     commands["evaluate"].add_argument("--policy", metavar="module:Class", help="somebody else's policy")
     commands["evaluate"].add_argument("--episodes", type=int, metavar="N", help="at least so many")
-    for name in ("run", "evaluate", "bench"):
+    commands["inspect"].add_argument("folders", nargs="+", type=Path, metavar="RUN_DIR", help="a run's folder")
+    commands["inspect"].add_argument("--games", type=int, default=1000, metavar="N", help="imagined (default 1000)")
+    for name in ("run", "evaluate", "inspect", "bench"):
         commands[name].add_argument("--quiet", action="store_true", help="no progress")
     for command in commands.values():
         command.add_argument("--json", action="store_true", help="the last line of stdout is one JSON object")
@@ -250,6 +253,29 @@ def _evaluate(args: argparse.Namespace) -> int:
     print(f"record {folder}")
     if args.json:
         _print_json({"folder": str(folder), **scores})
+    return 0
+
+
+def _inspect(args: argparse.Namespace) -> int:
+    from suite.record import RunRecord
+
+    if args.games < 1:
+        raise UserError(f"--games={args.games}: must be at least 1")
+    for folder in args.folders:
+        RunRecord.open(folder, lock=False)
+
+    from suite.diagnostics.rules import rules_of_run
+
+    reporter = _reporter(args.quiet)
+    found = {str(folder): rules_of_run(folder, args.games, reporter) for folder in args.folders}
+    reporter.stop()
+    for name, plays in found.items():
+        print(name)
+        columns = [[_value(kept[row]) for row in kept] for kept in plays.values()]
+        rows = [row.replace("_percent", " %").replace("_", " ") for row in next(iter(plays.values()))]
+        _print_table([["played by", *plays], *zip(rows, *columns, strict=True)])
+    if args.json:
+        _print_json(found)
     return 0
 
 

@@ -110,11 +110,19 @@ def test_bad_runs(suite, never, name):
         (["evaluate", ".", "more"], "unexpected argument 'more'"),
         (["evaluate", ".", "--episodes", "0"], "--episodes=0: must be at least 1"),
         (["evaluate", "/dev/null"], "record.json"),
+        (["inspect"], "required: RUN_DIR"),
+        (["inspect", "nowhere"], "nowhere is no run folder: it has no record.json"),
+        (["inspect", ".", "--games", "0"], "--games=0: must be at least 1"),
+        (["inspect", ".", "--game", "3"], "unknown option '--game'; did you mean '--games'?"),
     ],
 )
 def test_bad_commands(suite, never, words, message):
     refused(suite(*words), message)
     assert os.listdir() == []
+
+
+def test_inspecting_a_run_without_a_game(suite, folder):
+    refused(suite("inspect", str(folder)), f"{folder} has no world model of a two-player game")
 
 
 @pytest.fixture

@@ -1,11 +1,12 @@
-"""Does a game's world model keep the rules? Imagined play, replayed event by event in the real game.
+"""Does a game's world model keep the rules? Whole imagined games, replayed event by event in the real one.
 
-`python -m suite.diagnostics.rules RUN_DIR` prints it for the newest checkpoint of a run.
+`suite inspect RUN_DIR` prints it for the newest checkpoint of a run.
 """
 
 from __future__ import annotations
 
-import sys
+import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -15,28 +16,34 @@ import numpy as np
 from flax import nnx, struct
 
 from suite import checkpoint
+from suite.agent import rollout as play
 from suite.agent.dyna import Agent
 from suite.errors import UserError
 from suite.evaluation import agent_for, model_template
-from suite.interface.turns import CHANCE, Turn, choose_event
+from suite.interface.environment import State, TimeStep
+from suite.interface.turns import CHANCE, Turn
+from suite.policy.actor_critic import UniformPolicy
+from suite.policy.ppo import Learner
 from suite.record import RunRecord
-from suite.reporting import QuietReporter
+from suite.reporting import QuietReporter, Reporter
 from suite.world_model.imagination import Dream
 
-WARM_UP = 32  # events of real play, and one more for every batch, so that imagined play starts anywhere in a game
+GAMES = 1_000
 
 
 @struct.dataclass
 class Comparison:
-    """Imagined events beside the real ones that the same event would have led to; all [T, B].
+    """Imagined events beside the real ones that the same event led to; all [T, B].
 
     Attributes:
-      counted: the event belongs to the imagined play before its first illegal event or end, real or imagined.
-      legal: the event is possible in the real game.
-      player, legal_set, observations, reward, terminated: what it led to is right. After an end, where the next game
-        begins by chance, nothing but reward and end is compared.
-      chance_error: total variation distance of chance's odds; where chance is really next.
-      chance_next, goes_on: where `chance_error`, and where all but `reward` and `terminated`, are counted.
+      counted: the game has gone by the rules so far: no event before was illegal, or an end, real or imagined.
+      legal: the event is possible in the real game, and whoever plays it is to act there.
+      player, legal_set, observations: what it led to is right; counted where `goes_on`, for after an end another game
+        begins.
+      reward, terminated: what it led to is right.
+      ended: the real game ended there.
+      chance_next: chance is really next; `chance_error` is the total variation distance of its odds.
+      outcome: int32, what chance did, -1 where a player acted; [T, B, C] `odds` are the real ones.
     """
 
     counted: jax.Array
@@ -46,123 +53,220 @@ class Comparison:
     observations: jax.Array
     reward: jax.Array
     terminated: jax.Array
-    chance_error: jax.Array
-    chance_next: jax.Array
+    ended: jax.Array
     goes_on: jax.Array
+    chance_next: jax.Array
+    chance_error: jax.Array
+    outcome: jax.Array
+    odds: jax.Array
 
 
-def rules_kept(agent: Agent, world_model: nnx.State, tokenizer: Any, key: jax.Array, plays: int) -> dict[str, float]:
-    """How often imagined events keep the rules, in percent.
+@struct.dataclass
+class Games:
+    """B imagined games, each beside the real game in which the same happened.
 
-    Imagined play starts from real positions after random play, lasts up to `imagination.horizon` events, and everybody
-    moves uniformly among what the model says is legal, chance by the odds that it says.
+    Attributes:
+      state, turn: of the real environments.
+      imagined: what the model shows instead.
+      hidden_BH: the policy's memory before it sees that.
+      alive_B: bool; see `Comparison.counted`.
+    """
+
+    state: State
+    turn: Turn
+    imagined: TimeStep
+    hidden_BH: jax.Array
+    alive_B: jax.Array
+
+
+def rules_kept(
+    agent: Agent, learner: Learner, world_model: nnx.State, tokenizer: Any, key: jax.Array, games: int, uniform: bool
+) -> dict[str, float]:
+    """How well imagined games keep the rules.
+
+    A game is imagined from its first frame to its end, as dreams are that the agent learns from: our policy, a uniform
+    opponent and chance move as the model lets them. Where the model's context is full, another dream goes on from the
+    last imagined frame.
 
     Args:
-      agent: of a two-player task; its environment's `step` must be a function of state and event alone.
+      agent: of a two-player task; the event alone must determine what its environment does.
+      learner: whose policy plays.
       world_model, tokenizer: their parameters and state.
-      key: of the random play.
-      plays: at least so many imagined plays.
+      key: of the games.
+      games: at least so many.
+      uniform: our side moves uniformly too, among what the model says is legal.
 
     Returns:
-      legal_percent, player_percent, legal_set_percent, observations_percent, reward_percent, terminated_percent,
-      chance_error_percent (mean total variation distance), plays, events (how many were compared).
+      Percent of events: `legal_percent`; of the legal ones `player_percent`, `legal_set_percent` (next to act, and all
+      that is then legal), `observations_percent` (both players', every symbol), `reward_percent`, `terminated_percent`,
+      `chance_error_percent` (mean total variation distance of chance's odds). Percent of games: `return_percent`, of
+      those legal to the end, which came when it should, with the right return. `chance_largest_z`: over chance's
+      outcomes, by how many standard deviations of its real odds one was drawn too often or too rarely. `games`,
+      `events`.
     """
-    parts = []
-    compare = jax.jit(_compare, static_argnums=0)
-    for i in range(-(-plays // agent.batched.num_envs)):
-        parts.append(jax.device_get(compare(agent, world_model, tokenizer, jax.random.fold_in(key, i), WARM_UP + i)))
-    all_TB: Comparison = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
+    seats = agent.batched.num_envs
+    parts: list[Comparison] = []
+    for i in range(-(-games // seats)):
+        start_key, dream_key = jax.random.split(jax.random.fold_in(key, i))
+        state, now = _start(agent, learner, start_key, uniform), 0
+        columns = []
+        while now == 0 or bool(state.alive_B.any()):  # a real game's end ends it, whatever the model thinks
+            step_key = jax.random.fold_in(dream_key, now)
+            state, compared = _go_on(agent, learner, world_model, tokenizer, step_key, state, uniform)
+            columns.append(jax.device_get(compared))
+            now += 1
+        parts.append(jax.tree.map(lambda *x: np.concatenate(x), *columns))
+    return _summary(parts)
 
-    def percent(value, where) -> float:
-        return 100 * float(value[where].mean()) if where.any() else float("nan")
 
-    followed = all_TB.counted & all_TB.legal
-    names = {"player": all_TB.player, "legal_set": all_TB.legal_set, "observations": all_TB.observations}
+def _summary(parts: list[Comparison]) -> dict[str, float]:
+    """Of batches of games of different lengths."""
+
+    def flat(name: str) -> np.ndarray:
+        return np.concatenate([event_B for part in parts for event_B in getattr(part, name)])
+
+    def percent(name: str, where: np.ndarray) -> float:
+        return 100 * float(flat(name)[where].mean()) if where.any() else float("nan")
+
+    counted = flat("counted")
+    followed = counted & flat("legal")
+    names = ("player", "legal_set", "observations")
+    right = np.concatenate(
+        [
+            (part.counted & part.ended & part.terminated).any(0)
+            & ~(part.counted & ~(part.legal & part.reward & part.terminated)).any(0)
+            for part in parts
+        ]
+    )
     return {
-        "legal_percent": percent(all_TB.legal, all_TB.counted),
-        **{f"{name}_percent": percent(value, followed & all_TB.goes_on) for name, value in names.items()},
-        "reward_percent": percent(all_TB.reward, followed),
-        "terminated_percent": percent(all_TB.terminated, followed),
-        "chance_error_percent": percent(all_TB.chance_error, followed & all_TB.chance_next),
-        "plays": all_TB.counted.shape[1],
-        "events": int(all_TB.counted.sum()),
+        "legal_percent": percent("legal", counted),
+        **{f"{name}_percent": percent(name, followed & flat("goes_on")) for name in names},
+        "reward_percent": percent("reward", followed),
+        "terminated_percent": percent("terminated", followed),
+        "return_percent": 100 * float(right.mean()),
+        "chance_error_percent": percent("chance_error", followed & flat("chance_next")),
+        "chance_largest_z": _largest_z(flat("outcome")[followed], flat("odds")[followed]),
+        "games": len(right),
+        "events": int(counted.sum()),
     }
 
 
-def _compare(agent: Agent, world_model: nnx.State, tokenizer: Any, key: jax.Array, warm_up: int) -> Comparison:
-    batched = agent.batched
-    start_key, warm_key, play_key = jax.random.split(key, 3)
+def _largest_z(outcome_N: np.ndarray, odds_NC: np.ndarray) -> float:
+    """Largest standardized difference between how often an outcome was drawn and how often it should be."""
+    drawn = outcome_N >= 0
+    if not drawn.any():
+        return float("nan")
+    odds = odds_NC[drawn].astype(np.float64)
+    count_C = np.bincount(outcome_N[drawn], minlength=odds.shape[1])
+    variance_C = (odds * (1 - odds)).sum(0)
+    open_C = variance_C > 1e-9
+    if not open_C.any():
+        return 0.0
+    return float(np.abs((count_C - odds.sum(0))[open_C] / np.sqrt(variance_C[open_C])).max())
 
-    def anyone(key: jax.Array, turn: Turn) -> jax.Array:
-        """Everybody plays as `choose_event` lets the opponent play."""
-        no_seat = jnp.zeros_like(turn.seat) - 1
-        return choose_event(key, turn.replace(seat=no_seat), jnp.zeros_like(turn.player))  # type: ignore[attr-defined]
 
-    def real_event(i, carry):
-        state, shown = carry
-        event_key, step_key = jax.random.split(jax.random.fold_in(warm_key, i))
-        return batched.step(step_key, state, anyone(event_key, shown.turn))
+def _policy(agent: Agent, learner: Learner, uniform: bool) -> Any:
+    return UniformPolicy(agent.spec.num_actions) if uniform else nnx.merge(agent.policy_graph, learner.params)
 
-    real = jax.lax.fori_loop(0, warm_up, real_event, batched.reset(start_key))
-    model = nnx.merge(agent.world_model_graph, world_model)
-    horizon = agent.config.imagination.horizon
-    shown = real[1]
-    dream = Dream(model, agent.tokenizer, tokenizer, agent.spec, agent.tokens, horizon, shown.observation, shown.turn)
 
-    def event(carry, key):
-        (state, before), (dreamed_state, dreamed_before), alive_B = carry
-        event_key, dream_key = jax.random.split(key)
-        event_B = anyone(event_key, dreamed_before.turn)
-        possible_BN = jnp.concatenate([before.turn.legal_A, before.turn.chance_C > 0], axis=1)
-        offset_B = jnp.where(dreamed_before.turn.player == CHANCE, agent.spec.num_actions, 0)
-        legal_B = jnp.take_along_axis(possible_BN, (event_B + offset_B)[:, None], axis=1)[:, 0]
-        # One single environment's step, without a reset: the end itself is compared.
-        no_keys = jax.random.split(dream_key, batched.num_envs)
-        state, after = jax.vmap(batched.environment.step)(no_keys, state, event_B)
-        dreamed_state, dreamed = dream.step(dream_key, dreamed_state, event_B)
-        wanted, seen = after.turn, dreamed.turn
-        assert wanted is not None and seen is not None
-        rewards = agent.tokens
-        chance_B = (wanted.player == CHANCE) & ~after.terminated
+@functools.partial(jax.jit, static_argnums=(0, 3))
+def _start(agent: Agent, learner: Learner, key: jax.Array, uniform: bool) -> Games:
+    """Games at their first frame, where imagined and real ones agree."""
+    state, shown = agent.batched.reset(key)
+    batch = agent.batched.num_envs
+    hidden_BH = _policy(agent, learner, uniform).initial_hidden(batch)
+    assert shown.turn is not None
+    return Games(state, shown.turn, shown, hidden_BH, jnp.ones(batch, bool))
+
+
+@functools.partial(jax.jit, static_argnums=(0, 6))
+def _go_on(
+    agent: Agent,
+    learner: Learner,
+    world_model: nnx.State,
+    tokenizer: Any,
+    key: jax.Array,
+    games: Games,
+    uniform: bool,
+) -> tuple[Games, Comparison]:
+    """One dream, from where the imagined games are, and what the real ones make of its events."""
+    policy, model = _policy(agent, learner, uniform), nnx.merge(agent.world_model_graph, world_model)
+    start, horizon = games.imagined, agent.config.imagination.horizon
+    dream = Dream(model, agent.tokenizer, tokenizer, agent.spec, agent.tokens, horizon, start.observation, start.turn)
+    player = play.start(policy, dream, key, burn_in=0)
+    time_step = dataclasses.replace(player.time_step, first=start.first)
+    player = dataclasses.replace(player, time_step=time_step, hidden_BH=games.hidden_BH)
+    player, trajectory, _ = play.rollout(key, policy, learner.targets, dream, player, horizon)
+    # What was imagined after each event.
+    seen = jax.tree.map(
+        lambda during, last: jnp.concatenate([during[1:], last[None]]),
+        (trajectory.observation_TB, trajectory.turn_TB),
+        (player.time_step.observation, player.time_step.turn),
+    )
+
+    def event(carry: tuple[State, Turn, jax.Array], imagined: Any) -> tuple[Any, Comparison]:
+        state, real, alive_B = carry
+        event_B, turn, (observation, seen_turn), reward_B, terminated_B, step_key = imagined
+        possible_BN = jnp.concatenate([real.legal_A, real.chance_C > 0], axis=1)
+        chance_B = turn.player == CHANCE
+        column_B = event_B + jnp.where(chance_B, agent.spec.num_actions, 0)
+        legal_B = jnp.take_along_axis(possible_BN, column_B[:, None], axis=1)[:, 0] & (turn.player == real.player)
+        state, after = agent.batched.step(step_key, state, event_B)
+        wanted = after.turn
+        assert wanted is not None
+        ended_B = after.terminated | after.truncated
         result = Comparison(
             counted=alive_B,
             legal=legal_B,
-            player=seen.player == wanted.player,
-            legal_set=(seen.legal_A == wanted.legal_A).all(-1),
-            observations=(dreamed.observation == after.observation).all(-1)
-            & (seen.opponent_observation == wanted.opponent_observation).all(-1),
-            reward=rewards.reward_to_class(dreamed.reward) == rewards.reward_to_class(after.reward),
-            terminated=dreamed.terminated == after.terminated,
-            chance_error=jnp.abs(seen.chance_C - wanted.chance_C).sum(-1) / 2,
-            chance_next=chance_B & ~dreamed.terminated,
-            goes_on=~after.terminated & ~dreamed.terminated,
+            player=seen_turn.player == wanted.player,
+            legal_set=(seen_turn.legal_A == wanted.legal_A).all(-1),
+            observations=(observation == after.final_observation).all(-1)
+            & (seen_turn.opponent_observation == wanted.opponent_observation).all(-1),
+            reward=agent.tokens.reward_to_class(reward_B) == agent.tokens.reward_to_class(after.reward),
+            terminated=terminated_B == after.terminated,
+            ended=ended_B,
+            goes_on=~ended_B & ~terminated_B,
+            chance_next=(wanted.player == CHANCE) & ~ended_B & ~terminated_B,
+            chance_error=jnp.abs(seen_turn.chance_C - wanted.chance_C).sum(-1) / 2,
+            outcome=jnp.where(chance_B, event_B, -1),
+            odds=real.chance_C,
         )
-        alive_B = alive_B & legal_B & ~after.terminated & ~dreamed.terminated
-        return ((state, after), (dreamed_state, dreamed), alive_B), result
+        return (state, wanted, alive_B & legal_B & ~ended_B & ~terminated_B), result
 
-    alive_B = jnp.ones(batched.num_envs, bool)
-    carry = (real, dream.reset(play_key), alive_B)
-    return jax.lax.scan(event, carry, jax.random.split(play_key, horizon))[1]
+    keys = jax.random.split(jax.random.fold_in(key, 1), horizon)
+    imagined = (
+        trajectory.action_TB,
+        trajectory.turn_TB,
+        seen,
+        trajectory.reward_TB,
+        trajectory.terminated_TB,
+        keys,
+    )
+    (state, turn, alive_B), compared = jax.lax.scan(event, (games.state, games.turn, games.alive_B), imagined)
+    return Games(state, turn, player.time_step, player.hidden_BH, alive_B), compared
 
 
-def rules_of_run(folder: Path, plays: int = 1_000) -> dict[str, float]:
-    """`rules_kept` by the newest checkpoint of a run folder.
+def rules_of_run(folder: Path, games: int = GAMES, reporter: Reporter | None = None) -> dict[str, dict[str, float]]:
+    """`rules_kept` by the newest checkpoint of a run folder: in the "agent"'s own play, and in "uniform" play.
 
     Raises:
       UserError: no run folder, no checkpoint, no world model or no two-player game.
     """
+    reporter = reporter or QuietReporter()
     record = RunRecord.open(folder, lock=False)
     config = record.config
     if not (config.world_model.enabled and record.spec.two_player):
         raise UserError(f"{folder} has no world model of a two-player game")
-    agent = agent_for(config, QuietReporter())
+    agent = agent_for(config, reporter)
     template = jax.eval_shape(agent.init, jax.random.key(0))
     restored = checkpoint.restore_latest(folder / "checkpoints", model_template(template))
     if restored is None:
         raise UserError(f"{folder} has no checkpoint")
-    return rules_kept(agent, restored.model["world_model"], restored.model["tokenizer"], jax.random.key(0), plays)
-
-
-if __name__ == "__main__":
-    for name, value in rules_of_run(Path(sys.argv[1])).items():
-        print(f"{name} {value:.2f}")
+    model = restored.model
+    learner = Learner(params=model["policy"], optimizer=None, targets=model["targets"])
+    play_as = functools.partial(rules_kept, agent, learner, model["world_model"], model["tokenizer"])
+    found = {}
+    for name in ("agent", "uniform"):
+        reporter.message(f"imagining {games} games, {name} play")
+        found[name] = play_as(jax.random.key(0), games, uniform=name == "uniform")
+    return found

@@ -5,11 +5,15 @@ A single-agent task has no `Turn` (`TimeStep.turn is None`), decided while traci
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 CHANCE = 0
+FEW = 64  # weights that are summed one by one where one of them is drawn
+LAST_SHARE = 1 - 1e-6
 
 
 @struct.dataclass
@@ -62,10 +66,27 @@ def _draw(key: jax.Array, weight_BN: jax.Array) -> jax.Array:
     """An index [B] with probability proportional to its weight, which is not negative; 0 where all weights are 0.
 
     By inverting the cumulative distribution: one random number each, where noise for every one of bargaining's 1002
-    outcomes would cost more than all the rest of an event.
+    outcomes would cost more than all the rest of an event. So would their cumulative sums: of many weights, first a
+    group is drawn, then one of its members.
     """
-    cumulative_BN = jnp.cumsum(weight_BN, axis=-1)
-    total_B1 = cumulative_BN[..., -1:]
+    batch, count = weight_BN.shape
     # Below 1 by more than rounding, so that outcomes of weight 0 at the end are never drawn.
-    share_B1 = jax.random.uniform(key, total_B1.shape) * (1 - 1e-6)
-    return jnp.where(total_B1[..., 0] > 0, (cumulative_BN <= share_B1 * total_B1).sum(-1), 0)
+    share_B = jax.random.uniform(key, (batch,)) * LAST_SHARE
+    if count <= FEW:
+        return _invert(share_B, weight_BN)[0]
+    width = math.isqrt(count - 1) + 1
+    groups = -(-count // width)
+    weight_BGW = jnp.pad(weight_BN, ((0, 0), (0, groups * width - count))).reshape(batch, groups, width)
+    group_B, share_B = _invert(share_B, jnp.dot(weight_BGW, jnp.ones(width)))  # a CPU multiplies faster than it sums
+    members_BW = jnp.take_along_axis(weight_BGW, group_B[:, None, None], axis=1)[:, 0]
+    return group_B * width + _invert(share_B, members_BW)[0]
+
+
+def _invert(share_B: jax.Array, weight_BN: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where `share_B`, in [0, 1), of the total weight is reached: the index [B], and the share of its own weight."""
+    cumulative_BN = jnp.cumsum(weight_BN, axis=-1)
+    goal_B = share_B * cumulative_BN[:, -1]
+    index_B = jnp.where(cumulative_BN[:, -1] > 0, (cumulative_BN <= goal_B[:, None]).sum(-1), 0)
+    weight_B, up_to_B = (jnp.take_along_axis(x, index_B[:, None], axis=1)[:, 0] for x in (weight_BN, cumulative_BN))
+    inside_B = 1 - (up_to_B - goal_B) / jnp.where(weight_B > 0, weight_B, 1)
+    return index_B, jnp.clip(inside_B, 0, LAST_SHARE)

@@ -5,34 +5,55 @@ from __future__ import annotations
 import math
 
 import jax
+import numpy as np
 import pytest
 
 from suite import registry, run
+from suite.diagnostics import rules
 from suite.diagnostics.rules import rules_kept, rules_of_run
 from suite.errors import UserError
 from suite.reporting import QuietReporter
 from tests.tiny import CORRIDOR, PENNIES
 from tests.world_model.test_games import learned
 
+EVENTS = ("legal", "player", "legal_set", "observations", "reward", "terminated")
 
-def test_a_model_that_knows_the_rules_and_one_that_knows_nothing():
+
+@pytest.mark.parametrize("uniform", [False, True])
+def test_a_model_that_knows_the_rules_and_one_that_knows_nothing(uniform):
     agent, state, _, model, _ = learned()
-    kept = rules_kept(agent, model.params, state.tokenizer, jax.random.key(0), plays=200)
-    assert kept["plays"] == 200 and kept["events"] > 300
-    for name in ("legal", "player", "legal_set", "observations", "reward", "terminated"):
-        assert kept[f"{name}_percent"] > 90, name
-    assert math.isnan(kept["chance_error_percent"])  # chance acts at a game's start only, which is not compared
 
-    fresh = agent.init(jax.random.key(5)).world_model.params
-    broken = rules_kept(agent, fresh, state.tokenizer, jax.random.key(0), plays=200)
+    def kept_by(params):
+        return rules_kept(agent, state.learner, params, state.tokenizer, jax.random.key(0), 200, uniform)
+
+    kept = kept_by(model.params)
+    assert kept["games"] == 200 and kept["events"] > 300
+    for name in EVENTS:
+        assert kept[f"{name}_percent"] > 90, name
+    assert kept["return_percent"] > 80
+    assert kept["chance_largest_z"] < 4
+    assert math.isnan(kept["chance_error_percent"])  # chance acts at a game's start only, which is not imagined
+
+    broken = kept_by(agent.init(jax.random.key(5)).world_model.params)
     assert broken["legal_percent"] < 95 and broken["player_percent"] < 70
-    assert broken["observations_percent"] < 50
+    assert broken["observations_percent"] < 50 and broken["return_percent"] < 50
+
+
+def test_chance_that_does_as_it_should_and_chance_that_does_not():
+    odds = np.tile([0.5, 0.3, 0.2, 0.0], (4000, 1))
+    fair = np.random.default_rng(0).choice(4, 4000, p=odds[0])
+    assert rules._largest_z(fair, odds) < 4
+    assert rules._largest_z(np.where(np.arange(4000) % 10 == 0, 2, fair), odds) > 8
+    by_hand = np.array([0] * 60 + [1] * 40)
+    assert rules._largest_z(by_hand, np.full((100, 2), 0.5)) == pytest.approx(2)  # 10 too many, deviation 5
+    assert math.isnan(rules._largest_z(np.full(10, -1), np.zeros((10, 2))))  # nowhere did chance act
 
 
 def test_of_a_run(tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "TASKS", (CORRIDOR, PENNIES))
     game = run.run(registry.resolve("pennies", "m5", "smoke"), tmp_path, QuietReporter())
-    assert 0 <= rules_of_run(game.folder, plays=8)["legal_percent"] <= 100
+    kept = rules_of_run(game.folder, games=8)
+    assert kept["agent"]["games"] == 8 and 0 <= kept["uniform"]["legal_percent"] <= 100
     alone = run.run(registry.resolve("corridor", "random", "smoke"), tmp_path, QuietReporter())
     with pytest.raises(UserError, match="has no world model of a two-player game"):
         rules_of_run(alone.folder)

@@ -49,6 +49,16 @@ def test_chance_follows_its_probabilities():
     assert not (event == 1).any()
 
 
+@pytest.mark.parametrize("outcomes", [64, 65, 1002])
+def test_chance_follows_its_probabilities_among_many_outcomes(outcomes):
+    """Those that a program draws in one go and those that it draws group by group; most cannot happen."""
+    likely = np.zeros(outcomes)
+    likely[[0, 1, outcomes // 2, outcomes - 1]] = 0.1, 0.4, 0.3, 0.2
+    event = events(turns(CHANCE, [False, False, False], likely.tolist()))
+    np.testing.assert_allclose(shares(event, outcomes), likely, atol=0.04)
+    assert (likely[event] > 0).all()
+
+
 def test_a_mixed_batch_goes_to_each_its_own():
     player = jnp.arange(N, dtype=jnp.int32) % 3
     turn = turns(1, [True, True, True], [0.0, 1.0]).replace(
