@@ -1,5 +1,7 @@
 """Two-player games of OpenSpiel (Lanctot et al. 2019) as pure environments: the engine, walked once into tables.
 
+Games that are too large for tables are played by the engine, on the host (`adapters.openspiel_host`).
+
 Importing this module, and `spec` of the games in `GAMES`, load no engine.
 """
 
@@ -22,20 +24,19 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from adapters import game_tables
+from adapters import game_tables, openspiel_host
 from adapters.game_tables import Tables
+from adapters.openspiel_host import MAX_REWARD_CLASSES, SIGNS
 from suite.cache import cache_dir
 from suite.errors import UserError, did_you_mean
-from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
+from suite.interface.environment import Environment, EnvironmentSpec, ObservationSpec, TimeStep
 from suite.interface.turns import Turn
 
 GAMES = {"tic_tac_toe": "tic_tac_toe", "leduc": "leduc_poker", "bargaining": "bargaining"}
 
 Progress = Callable[[str, float], None]
 
-_SIGNS = (-1.0, 0.0, 1.0)
-_SCHEMA = 1  # of the files in the cache folder
-_MAX_REWARD_CLASSES = 32  # a game with more levels of return is learned from its sign
+_SCHEMA = 1  # of the files in the cache folder, and of what is too large for tables
 
 
 def _specification(
@@ -54,14 +55,17 @@ def _specification(
 
 
 _SPECS = {
-    "tic_tac_toe": _specification("tic_tac_toe", 27, 1, 9, 0, _SIGNS),
-    "leduc": _specification("leduc", 16, 13, 3, 6, _SIGNS),  # pays -13..13, learned from the sign: fidelity note 32
+    "tic_tac_toe": _specification("tic_tac_toe", 27, 1, 9, 0, SIGNS),
+    "leduc": _specification("leduc", 16, 13, 3, 6, SIGNS),  # pays -13..13, learned from the sign: fidelity note 32
     "bargaining": _specification("bargaining", 93, 1, 121, 1002, tuple(map(float, range(11)))),
 }
 
 
 def spec(name: str) -> EnvironmentSpec:
     """What the game is: at once for those in `GAMES`; any other sequential two-player game is walked for it.
+
+    One that is too large for tables is played at random instead: see `openspiel_host.measured`. That it is too large
+    is remembered in the cache folder.
 
     Args:
       name: a name in `GAMES`, or a game's short name in the library.
@@ -70,11 +74,13 @@ def spec(name: str) -> EnvironmentSpec:
       UserError: no such game, or none that can be played here; see `make`.
     """
     name = _canonical(name)
-    return _SPECS.get(name) or _measure(name, walked(name))
+    return _SPECS.get(name) or _specified(name, _walked(name, None))
 
 
-def make(name: str, progress: Progress | None = None) -> TableGame:
+def make(name: str, progress: Progress | None = None) -> Environment:
     """The game `name`, ready to be compiled; its tables are built once and kept in the cache folder.
+
+    A game that is too large for tables steps on the host, and is truncated after `openspiel_host.LIMIT` events.
 
     Args:
       name: as for `spec`.
@@ -82,35 +88,58 @@ def make(name: str, progress: Progress | None = None) -> TableGame:
 
     Raises:
       UserError: the game is unknown; or its players move at once, or are not two; or what they see is not a vector
-        of symbols; or it is too large for tables.
+        of symbols.
     """
-    tables = walked(name, progress)
     name = _canonical(name)
-    return TableGame(_SPECS.get(name) or _measure(name, tables), tables)
+    tables = _walked(name, progress)
+    spec = _SPECS.get(name) or _specified(name, tables)
+    return openspiel_host.make(_engine(name), spec) if tables is None else TableGame(spec, tables)
+
+
+def fully_observed(name: str) -> bool:
+    """Whether both players see all there is, as on a board; arguments and errors as for `spec`."""
+    import pyspiel
+
+    return _engine(_canonical(name)).get_type().information == pyspiel.GameType.Information.PERFECT_INFORMATION
 
 
 def walked(name: str, progress: Progress | None = None) -> Tables:
-    """The game's tables in NumPy, from the cache folder or from the engine. Arguments and errors: `make`."""
-    name = _canonical(name)
+    """The game's tables in NumPy, from the cache folder or from the engine.
+
+    Args:
+      name, progress: as for `make`.
+
+    Raises:
+      UserError: as `make`; or the game is too large for tables.
+    """
+    tables = _walked(_canonical(name), progress)
+    if tables is None:
+        raise UserError(f"openspiel/{name} is too large for tables")
+    return tables
+
+
+def _walked(name: str, progress: Progress | None) -> Tables | None:
+    """As `walked`; None if the game is too large for tables."""
     message = f"Loading openspiel/{name}"
     report = functools.partial(progress, message) if progress else lambda fraction: None
     report(0.0)
     version = importlib.metadata.version("open_spiel")
     path = cache_dir() / "openspiel" / f"{name}-{version}-{_SCHEMA}.npz"
+    too_large = path.with_name(f"{path.stem}.too_large")  # an empty file
     tables = _read(path)
-    if tables is None:
+    if tables is None and not too_large.exists():
         game = _engine(name)
         key = game_tables.last_offer if name == "bargaining" else None
         try:
             tables = game_tables.build(game, key, report)
-        except game_tables.TooLargeError as error:
-            limit = f"{error.args[0]:,}"
-            raise UserError(f"openspiel/{name} is too large for tables: it has more than {limit} states") from None
+        except game_tables.TooLargeError:
+            with contextlib.suppress(OSError):
+                too_large.parent.mkdir(parents=True, exist_ok=True)
+                too_large.touch()
         except game_tables.NotCategoricalError:
-            raise UserError(
-                f"openspiel/{name} cannot be played here: its observations are not whole numbers from 0 to 255"
-            ) from None
-        _write(path, tables)
+            raise _not_categorical(name) from None
+        else:
+            _write(path, tables)
     report(1.0)
     return tables
 
@@ -154,7 +183,7 @@ class TableGame:
         moved = following >= 0
         state = GameState(jnp.where(moved, following, state.node), state.seat)
         reward = self._tables["return_2N"][state.seat - 1, state.node]
-        if self.spec.reward_classes == _SIGNS:
+        if self.spec.reward_classes == SIGNS:
             reward = jnp.sign(reward)
         ended = moved & (state.node >= self._num_open)
         reward = jnp.where(ended, reward, jnp.float32(0))
@@ -241,8 +270,12 @@ def _canonical(name: str) -> str:
     return {game: short for short, game in GAMES.items()}.get(name, name)
 
 
+def _specified(name: str, tables: Tables | None) -> EnvironmentSpec:
+    """The specification that a game's tables imply, or random play where there are none."""
+    return _measure(name, tables) if tables else _measure_by_play(name)
+
+
 def _measure(name: str, tables: Tables) -> EnvironmentSpec:
-    """The specification that a game's tables imply."""
     levels = tuple(float(level) for level in np.union1d(tables.return_2N[:, tables.num_open :], [0.0]))
     return _specification(
         name,
@@ -250,8 +283,23 @@ def _measure(name: str, tables: Tables) -> EnvironmentSpec:
         high=max(1, int(tables.observation_2NO.max())),
         actions=tables.next_DA.shape[-1],
         outcomes=tables.chance_KC.shape[-1],
-        rewards=levels if len(levels) <= _MAX_REWARD_CLASSES else _SIGNS,
+        rewards=levels if len(levels) <= MAX_REWARD_CLASSES else SIGNS,
     )
+
+
+@functools.lru_cache(maxsize=16)
+def _measure_by_play(name: str) -> EnvironmentSpec:
+    game = _engine(name)
+    symbols = int(np.prod(game.observation_tensor_shape()))
+    known = _specification(name, symbols, 1, game.num_distinct_actions(), game.max_chance_outcomes(), SIGNS)
+    try:
+        return openspiel_host.measured(game, known)
+    except game_tables.NotCategoricalError:
+        raise _not_categorical(name) from None
+
+
+def _not_categorical(name: str) -> UserError:
+    return UserError(f"openspiel/{name} cannot be played here: its observations are not whole numbers from 0 to 255")
 
 
 def _engine(name: str) -> Any:

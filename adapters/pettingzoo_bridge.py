@@ -101,10 +101,10 @@ class SuiteAECEnv(pettingzoo.AECEnv):
         self._shown: Any = None  # a time step that leads with the two seats
 
     def observation_space(self, agent: str) -> spaces.Space:
-        return self.observation_spaces[agent]
+        return self.observation_spaces[AGENTS[_index(agent)]]
 
     def action_space(self, agent: str) -> spaces.Space:
-        return self.action_spaces[agent]
+        return self.action_spaces[AGENTS[_index(agent)]]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """A new game; `options` are not used."""
@@ -144,8 +144,8 @@ class SuiteAECEnv(pettingzoo.AECEnv):
         self._accumulate_rewards()
 
     def observe(self, agent: str) -> dict[str, np.ndarray]:
-        """What this agent sees now, whoever is to act."""
-        index = AGENTS.index(agent)
+        """What this agent sees now, whoever is to act. Raises a `UserError` if there is no such agent."""
+        index = _index(agent)
         legal_A = self._shown.turn.legal_A[index] & (agent == self.agent_selection) & (not self._over())
         return {"observation": self._shown.observation[index].copy(), "action_mask": legal_A.astype(np.int8)}
 
@@ -181,6 +181,13 @@ class SuiteAECEnv(pettingzoo.AECEnv):
             self.agent_selection = AGENTS[1 - AGENTS.index(self.agent_selection)]  # the last to act hears it last
         else:
             self.agent_selection = AGENTS[int(self._shown.turn.player[0]) - 1]
+
+
+def _index(agent: str) -> int:
+    """0 or 1: the seat of an agent."""
+    if agent not in AGENTS:
+        raise UserError(f"no seat {agent!r}; valid: {', '.join(AGENTS)}")
+    return AGENTS.index(agent)
 
 
 @functools.lru_cache(maxsize=16)

@@ -92,8 +92,8 @@ OPENSPIEL_PAPER: dict[str, Any] = {
     "checkpoint.every_steps": 10_000,
 }
 
-# Games in which both players see everything need no memory.
-FULLY_OBSERVED = {"openspiel/tic_tac_toe"}
+# Games in which both players see everything need no memory. Of these three it is known without the engine.
+FULLY_OBSERVED = {"openspiel/tic_tac_toe": True, "openspiel/leduc": False, "openspiel/bargaining": False}
 
 OPENSPIEL_SMALL: dict[str, Any] = {
     "protocol.final_fraction": 0.2,
@@ -207,7 +207,12 @@ def openspiel_smoke(config: Config) -> Config:
 
 
 def _without_needless_memory(config: Config) -> Config:
-    return apply_changes(config, {"policy.rnn_size": 0}) if config.task in FULLY_OBSERVED else config
+    observed = FULLY_OBSERVED.get(config.task)
+    if observed is None:
+        from adapters.openspiel import fully_observed
+
+        observed = fully_observed(config.task.partition("/")[2])
+    return apply_changes(config, {"policy.rnn_size": 0}) if observed else config
 
 
 def craftax_classic_small(config: Config) -> Config:

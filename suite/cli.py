@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from suite.compilation import quiet_xla
-from suite.errors import RunError, UserError, did_you_mean
+from suite.errors import RunError, UserError, did_you_mean, host_errors
 
 if TYPE_CHECKING:
     from suite.reporting import Reporter
@@ -35,7 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code."""
     quiet_xla()
     try:
-        return _dispatch(sys.argv[1:] if argv is None else list(argv))
+        with host_errors():
+            return _dispatch(sys.argv[1:] if argv is None else list(argv))
     except (UserError, RunError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_INPUT if isinstance(error, UserError) else FAILED

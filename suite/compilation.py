@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import platform
 from pathlib import Path
@@ -16,9 +17,11 @@ CPU_INFO = Path("/proc/cpuinfo")
 def quiet_xla() -> None:
     """Silences XLA's own log, unless the user set its level: call it before JAX is imported.
 
-    Each program that XLA loads from the cache otherwise prints a page about features that no CPU has.
+    Each program that XLA loads from the cache otherwise prints a page about features that no CPU has. So does JAX of
+    an error on the host, which reaches us as an exception besides (`suite.errors.host_errors`).
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
 
 
 def enable_compilation_cache() -> None:

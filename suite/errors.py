@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
 
 
 class UserError(Exception):
@@ -21,3 +23,17 @@ def did_you_mean(word: str, valid: Iterable[str]) -> str:
     if near:
         return f"did you mean {near[0]!r}?"
     return f"valid: {', '.join(choices)}"
+
+
+@contextlib.contextmanager
+def host_errors() -> Iterator[None]:
+    """Brings out a `UserError` or `RunError` that the host raised inside a compiled program: JAX only quotes it."""
+    try:
+        yield
+    except (UserError, RunError):
+        raise
+    except Exception as error:
+        quoted = re.search(r"^(?:suite\.errors\.)?(UserError|RunError): (.*)$", str(error), re.MULTILINE)
+        if quoted is None:
+            raise
+        raise {"UserError": UserError, "RunError": RunError}[quoted[1]](quoted[2]) from error

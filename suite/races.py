@@ -22,6 +22,7 @@ from suite.compilation import enable_compilation_cache
 from suite.config import Config
 from suite.interface.batching import Batched
 from suite.interface.environment import BatchedEnvironment, Environment
+from suite.interface.host import HostEnvironment
 from suite.interface.turns import choose_event
 from suite.world_model.transformer import WorldModel
 
@@ -41,11 +42,10 @@ def seconds_of(function: Callable[[], Any], least: float = 1.0, repeats: int = 3
 
 
 def reset_race(config: Config, environment: Environment) -> Table:
-    """Random play with exact auto-reset, against no reset at all and the package's own auto-reset if it has one."""
-    contestants: dict[str, BatchedEnvironment] = {
-        "no reset": NoReset(environment, RACE_ENVS),
-        "exact auto-reset": Batched(environment, RACE_ENVS),
-    }
+    """Random play with exact auto-reset, against no reset at all (where that can be) and the package's own."""
+    contestants: dict[str, BatchedEnvironment] = {"exact auto-reset": Batched(environment, RACE_ENVS)}
+    if not isinstance(environment, HostEnvironment):  # whose engines take no step after an end
+        contestants["no reset"] = NoReset(environment, RACE_ENVS)
     own = registry.task(config.task).own_auto_reset
     if own is not None:
         contestants["the package's own auto-reset"] = own()(RACE_ENVS)
@@ -57,7 +57,8 @@ def reset_race(config: Config, environment: Environment) -> Table:
             play()
             times[name].append(time.perf_counter() - start)
     speed = {name: RACE_ENVS * RACE_STEPS / sorted(values)[len(values) // 2] for name, values in times.items()}
-    return [{"environment": n, "steps/s": s, "of no reset": s / speed["no reset"]} for n, s in speed.items()]
+    bound = speed.get("no reset", float("nan"))
+    return [{"environment": n, "steps/s": s, "of no reset": s / bound} for n, s in speed.items()]
 
 
 @dataclasses.dataclass(frozen=True)

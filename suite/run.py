@@ -17,7 +17,7 @@ import numpy as np
 from suite import checkpoint, registry
 from suite.agent.dyna import Agent, TrainState
 from suite.config import Config
-from suite.errors import RunError, UserError
+from suite.errors import RunError, UserError, host_errors
 from suite.evaluation import agent_for, episode_rows, model_of, record_evaluation
 from suite.policy.ppo import Learner
 from suite.record import RunRecord, disk_full_is_an_error, run_folder
@@ -85,7 +85,7 @@ class _Training:
             with self._phase("start"):
                 state = self._restore()
             self.reporter.start(self.config.protocol.steps, self.steps)
-            with self._signals():
+            with self._signals(), host_errors():
                 while not self.done and not self.stop_requested:
                     before = self.steps
                     state = self._iterate(state)

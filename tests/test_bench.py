@@ -6,6 +6,7 @@ import pytest
 
 from suite import bench, races, registry
 from suite.reporting import QuietReporter
+from tests.interface.test_host import Walks
 from tests.tiny import CORRIDOR
 
 
@@ -24,7 +25,15 @@ def test_every_phase_is_measured_and_projected(monkeypatch):
     seconds = (6 * (sum(ms.values()) - ms["imagine"]) + 4 * ms["imagine"]) / 1e3
     assert report["projected hours of the whole run"] == pytest.approx(seconds / 3600)
     assert [row["environment"] for row in report["environment steps/s, random actions"]] == [
-        "no reset",
         "exact auto-reset",
+        "no reset",
     ]
     assert report["one imagined step"][0]["times faster"] > 0
+
+
+def test_hosted_engines_race_without_the_contestant_that_plays_past_the_end(monkeypatch):
+    monkeypatch.setattr(races, "RACE_ENVS", 2)
+    monkeypatch.setattr(races, "RACE_STEPS", 30)
+    monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR))
+    (row,) = races.reset_race(registry.resolve("corridor", "m5", "smoke"), Walks())
+    assert row["environment"] == "exact auto-reset" and row["steps/s"] > 0

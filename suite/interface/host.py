@@ -11,7 +11,7 @@ from __future__ import annotations
 import collections
 import math
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -40,6 +40,7 @@ class HostStep(NamedTuple):
       player: in a game, who acts next: 0 chance, 1 or 2.
       legal_A: in a game, bool; legal actions of a player to act, else all false.
       chance_C: in a game, float32; probabilities where chance acts, else all zero.
+      raw_return: float32 [N], the engine's own returns so far; only of a game whose specification names this statistic.
     """
 
     observation: Any
@@ -49,6 +50,7 @@ class HostStep(NamedTuple):
     player: Any = None
     legal_A: Any = None
     chance_C: Any = None
+    raw_return: Any = None
 
 
 class HostEngine(Protocol):
@@ -82,7 +84,7 @@ class HostEnvironment:
     """A host engine as an `Environment`: works under jit, vmap and loops; a batch is one call to the host.
 
     Args:
-      spec: what the task is; of statistics, only a game's "seat" can be given.
+      spec: what the task is; of statistics, only a game's "seat" and "raw_return" can be given.
       make_engine: makes one engine; called as often as engines are needed side by side.
       limit: an episode of so many steps is truncated, unless it ended by itself.
     """
@@ -104,6 +106,7 @@ class HostEnvironment:
                 player=integer,
                 legal_A=jax.ShapeDtypeStruct((spec.num_actions,), jnp.bool_),
                 chance_C=jax.ShapeDtypeStruct((spec.chance_outcomes,), jnp.float32),
+                raw_return=jax.ShapeDtypeStruct((2,), jnp.float32) if "raw_return" in dict(spec.statistics) else None,
             )
 
     def reset(self, key: jax.Array, seat: jax.Array | None = None) -> tuple[HostState, TimeStep]:
@@ -123,7 +126,7 @@ class HostEnvironment:
             self._visit, self._result, state.seed, state.actions, state.length, vmap_method="broadcast_all"
         )
         observation, reward, turn = shown.observation, shown.reward, None
-        names = [name for name, _ in self.spec.statistics]
+        statistics = {}
         if state.seat is not None:
             turn = Turn(
                 player=shown.player,
@@ -133,6 +136,10 @@ class HostEnvironment:
                 opponent_observation=observation[2 - state.seat],
             )
             observation, reward = observation[state.seat - 1], reward[state.seat - 1]
+            if shown.raw_return is not None:
+                statistics["raw_return"] = shown.raw_return[state.seat - 1]
+            if "seat" in dict(self.spec.statistics):
+                statistics["seat"] = state.seat.astype(jnp.float32)
         return TimeStep(
             observation=observation,
             reward=reward,
@@ -140,7 +147,7 @@ class HostEnvironment:
             truncated=(shown.truncated | (state.length >= self.limit)) & ~shown.terminated,
             first=first,
             final_observation=observation,
-            statistics={} if state.seat is None else dict.fromkeys(names, state.seat.astype(jnp.float32)),
+            statistics=statistics,
             turn=turn,
         )
 
@@ -205,20 +212,26 @@ class EnginePool:
         return shown
 
 
-def random_rewards(engine: HostEngine, num_actions: int, steps: int = 1000) -> set[float]:
-    """The rewards that `steps` random legal steps pay, always the same ones: of games, both players'."""
+def random_steps(engine: HostEngine, num_actions: int, steps: int) -> Iterator[HostStep]:
+    """What `steps` random legal steps and the resets between them show, always the same."""
     random = np.random.default_rng(0)
-    shown, rewards = engine.reset(0), {0.0}
+    shown = engine.reset(0)
+    yield shown
     for seed in range(1, steps + 1):
         if shown.player == CHANCE:
             action = random.choice(len(shown.chance_C), p=shown.chance_C)
         else:
             action = random.choice(num_actions if shown.legal_A is None else np.flatnonzero(shown.legal_A))
         shown = engine.step(int(action))
-        rewards |= {float(reward) for reward in np.ravel(shown.reward)}
+        yield shown
         if shown.terminated or shown.truncated:
             shown = engine.reset(seed)
-    return rewards
+            yield shown
+
+
+def random_rewards(engine: HostEngine, num_actions: int, steps: int = 1000) -> set[float]:
+    """The rewards that `random_steps` pay, and 0: of games, both players'."""
+    return {0.0}.union(*(np.ravel(shown.reward).tolist() for shown in random_steps(engine, num_actions, steps)))
 
 
 def reward_classes(rewards: Iterable[float]) -> tuple[float, ...]:

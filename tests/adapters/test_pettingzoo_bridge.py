@@ -116,6 +116,9 @@ def test_misuse_is_one_error():
     env.step(0)
     with pytest.raises(UserError, match=r"^illegal action 1 of player_2; legal: 0$"):
         env.step(1)
+    for ask in (env.observe, env.action_space, env.observation_space):
+        with pytest.raises(UserError, match=r"^no seat 'player_3'; valid: player_1, player_2$"):
+            ask("player_3")
     env.step(0)
     with pytest.raises(UserError, match="one player"):
         pettingzoo_bridge.env(Corridor())

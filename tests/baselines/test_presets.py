@@ -159,3 +159,11 @@ def test_schedule_of_imagined_updates():
     linear = ["imagination.schedule=linear", "imagination.start_step=0", "imagination.updates=300"]
     config = registry.resolve("craftax_classic", "m5", "paper", linear)
     assert [config.imagined_updates(step) for step in (0, 500_000, 1_000_000)] == [0, 150, 300]
+
+
+@pytest.mark.parametrize(
+    ("game", "memory"), [("tic_tac_toe", False), ("leduc", True), ("bargaining", True), ("hex", False), ("pig", False)]
+)
+def test_a_memory_only_where_something_is_hidden(game, memory):
+    for preset in ("paper", "small", "smoke"):
+        assert bool(registry.resolve(f"openspiel/{game}", "m5", preset).policy.rnn_size) == memory
