@@ -162,7 +162,8 @@ def test_schedule_of_imagined_updates():
 
 
 @pytest.mark.parametrize(
-    ("game", "memory"), [("tic_tac_toe", False), ("leduc", True), ("bargaining", True), ("nim", False), ("kuhn_poker", True)]
+    ("game", "memory"),
+    [("tic_tac_toe", False), ("leduc", True), ("bargaining", True), ("nim", False), ("kuhn_poker", True)],
 )
 def test_a_memory_only_where_something_is_hidden(game, memory):
     for preset in ("paper", "small", "smoke"):
