@@ -113,7 +113,7 @@ class WorldModelConfig:
     """Transformer world model (Section 3.6, Appendix A.2.2)."""
 
     enabled: bool = True
-    block_teacher_forcing: Literal[True] = True  # BTF; the autoregressive mask belongs to M1 to M4
+    block_teacher_forcing: bool = True  # BTF; false: token by token, as M1 to M4 (note 19)
     sequence_length: Positive = 20  # T_WM: blocks per training sequence, and keys kept in imagination
     embed_dim: Positive = 128
     layers: Positive = 3

@@ -120,7 +120,7 @@ def cache_race(agent: Agent) -> Table:
     frames = jax.random.randint(jax.random.key(1), (batch, length, tokens.tokens_per_frame), 0, tokens.num_codes)
     actions = jax.random.randint(jax.random.key(2), (batch, length), 0, tokens.num_actions)
     cache = model.init_cache(batch, length)
-    cache = dataclasses.replace(cache, index=jnp.int32(length - 1))
+    cache = dataclasses.replace(cache, index=jnp.int32((length - 1) * model.block))
 
     @jax.jit
     def cached(params, cache):

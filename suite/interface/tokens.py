@@ -19,12 +19,13 @@ class TokenSpec:
 
     Attributes:
       tokens_per_frame: L; in a game both players' observations, player 1's first.
-      num_codes: K.
+      num_codes: K; 0 where tokens are no codes.
       num_actions: of the stream; in a game those of both players and chance, see `turns.stream_action`.
       reward_classes: ascending reward levels; see `EnvironmentSpec.reward_classes`.
       placed: a code means something else at each of the L places, and is embedded so.
       player_actions: A of a two-player game, whose turns are predicted too; 0 for single-agent tasks.
       chance_outcomes: C of a two-player game.
+      token_size: numbers in a token that is no code but a vector; 0: tokens are codes.
     """
 
     tokens_per_frame: int
@@ -34,6 +35,7 @@ class TokenSpec:
     placed: bool = False
     player_actions: int = 0
     chance_outcomes: int = 0
+    token_size: int = 0
 
     @property
     def two_player(self) -> bool:
@@ -63,7 +65,15 @@ class Tokenizer(Protocol):
 
     @property
     def num_codes(self) -> int:
-        """K."""
+        """K; 0 where tokens are vectors."""
+
+    @property
+    def token_size(self) -> int:
+        """Numbers in a token that is a vector; 0: tokens are codes."""
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """(rows, columns) of tokens in a frame."""
 
     @property
     def metrics(self) -> tuple[str, ...]:
@@ -76,10 +86,10 @@ class Tokenizer(Protocol):
         """Learns from one batch of N observations; returns the new state and scalar metrics."""
 
     def encode(self, state: TokenizerState, observation: jax.Array) -> jax.Array:
-        """int32 tokens [..., L] of observations [..., O]."""
+        """int32 tokens [..., L], or float32 vectors [..., L, P], of observations [..., O]."""
 
     def decode(self, state: TokenizerState, tokens: jax.Array) -> jax.Array:
-        """uint8 observations [..., O] of tokens [..., L]."""
+        """uint8 observations [..., O] of tokens [..., L] or [..., L, P]."""
 
     def valid_codes(self, state: TokenizerState) -> jax.Array:
         """Bool [K]: codes that have a meaning; the others must never be sampled."""

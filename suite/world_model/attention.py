@@ -17,25 +17,29 @@ from suite.world_model.dropout import dropout
 GROUPS = 10
 
 
-def block_causal_attention(
+def causal_attention(
     query_BSNH: jax.Array,
     key_BSNH: jax.Array,
     value_BSNH: jax.Array,
     *,
     block: int,
+    unit: int | None = None,
     groups: int = GROUPS,
     dropout_rate: float = 0.0,
     dropout_key: jax.Array | None = None,
 ) -> jax.Array:
-    """Attention of every token to its whole own block and all earlier ones (Section 3.6, fidelity note 18).
+    """Attention of every token to its whole own unit and all earlier ones.
+
+    With the block as the unit that is the block-causal mask (Section 3.6, fidelity note 18), with a token the usual one.
 
     Another kernel replaces this one function. Here the queries are cut into `groups` runs of whole blocks, each of
-    which sees a static prefix of the keys: with a run for each block nothing that the mask forbids is computed.
+    which sees a static prefix of the keys: with a run for each block nothing that the block-causal mask forbids is computed.
     The backward pass recomputes the weights: S * S of them are not kept.
 
     Args:
       query_BSNH, key_BSNH, value_BSNH: [B, S, N, H], S a multiple of `block`.
       block: tokens per block.
+      unit: tokens that see one another: 1, or `block` (None).
       groups: runs of queries; 1 computes the whole square.
       dropout_rate: of the attention weights, where `dropout_key` is not None.
 
@@ -50,16 +54,16 @@ def block_causal_attention(
         key = None if dropout_key is None else jax.random.fold_in(dropout_key, index)
         queries, seen = slice(start * block, stop * block), slice(0, stop * block)
         run = query_BSNH[:, queries], key_BSNH[:, seen], value_BSNH[:, seen], key
-        outputs.append(_attend_run(*run, start * block, block, dropout_rate))
+        outputs.append(_attend_run(*run, start * block, unit or block, dropout_rate))
     return jnp.concatenate(outputs, axis=1)
 
 
-def cached_attention(query_BQNH: jax.Array, key_BNSH: jax.Array, value_BNSH: jax.Array, filled: jax.Array) -> jax.Array:
-    """Attention of one block's queries to the first `filled` (int32 scalar) of the cached keys and values.
+def cached_attention(query_BQNH: jax.Array, key_BNSH: jax.Array, value_BNSH: jax.Array, last_Q: jax.Array) -> jax.Array:
+    """Attention of new queries to the cached keys and values, each up to index `last_Q` (int32) and with it.
 
     These lead with the heads, as the products read them: nothing of the cache's size is moved.
     """
-    visible_QS = jnp.broadcast_to(jnp.arange(key_BNSH.shape[2]) < filled, (query_BQNH.shape[1], key_BNSH.shape[2]))
+    visible_QS = jnp.arange(key_BNSH.shape[2])[None] <= last_Q[:, None]
     mixed_BNQH, _ = _attend(query_BQNH.swapaxes(1, 2), key_BNSH, value_BNSH, visible_QS)
     return mixed_BNQH.swapaxes(1, 2)
 
@@ -67,25 +71,25 @@ def cached_attention(query_BQNH: jax.Array, key_BNSH: jax.Array, value_BNSH: jax
 # Differentiated by hand, for the gradient needs neither the softmax's reductions nor anything of S * S once more:
 # with p the weights, o the output and dp the gradient of p, that of the scores is p * (dp - <do, o>).
 @functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5, 6))
-def _attend_run(query, key, value, dropout_key, first: int, block: int, rate: float) -> jax.Array:
+def _attend_run(query, key, value, dropout_key, first: int, unit: int, rate: float) -> jax.Array:
     """Attention of a run of whole blocks, whose first query is token `first`, to everything up to its end."""
-    return _run_forward(query, key, value, dropout_key, first, block, rate)[0]
+    return _run_forward(query, key, value, dropout_key, first, unit, rate)[0]
 
 
-def _run_forward(query, key, value, dropout_key, first: int, block: int, rate: float):
+def _run_forward(query, key, value, dropout_key, first: int, unit: int, rate: float):
     # Heads before tokens: on a CPU the products are several times faster so.
     query_BNQH, key_BNSH, value_BNSH = (x.swapaxes(1, 2) for x in (query, key, value))
-    visible_QS = _visible(query.shape[1], key.shape[1], first, block)
+    visible_QS = _visible(query.shape[1], key.shape[1], first, unit)
     mixed_BNQH, log_total_BNQ1 = _attend(query_BNQH, key_BNSH, value_BNSH, visible_QS, rate, dropout_key)
     saved = query_BNQH, key_BNSH, value_BNSH, dropout_key, mixed_BNQH, log_total_BNQ1
     return mixed_BNQH.swapaxes(1, 2), saved
 
 
-def _run_backward(first: int, block: int, rate: float, saved, grad):
+def _run_backward(first: int, unit: int, rate: float, saved, grad):
     query_BNQH, key_BNSH, value_BNSH, dropout_key, mixed_BNQH, log_total_BNQ1 = saved
     grad_BNQH, dtype = grad.swapaxes(1, 2), grad.dtype
     scale = 1 / math.sqrt(query_BNQH.shape[-1])
-    score_BNQS = _scores(query_BNQH * scale, key_BNSH, _visible(query_BNQH.shape[2], key_BNSH.shape[2], first, block))
+    score_BNQS = _scores(query_BNQH * scale, key_BNSH, _visible(query_BNQH.shape[2], key_BNSH.shape[2], first, unit))
     weight_BNQS = jnp.exp(score_BNQS - log_total_BNQ1)
     dropped_BNQS = dropout(weight_BNQS, rate, dropout_key).astype(dtype)
     grad_value_BNHS = _product("bnqh,bnqs->bnhs", grad_BNQH, dropped_BNQS)  # of this shape: a CPU's fast path
@@ -121,32 +125,31 @@ def _scores(query_BNQH: jax.Array, key_BNSH: jax.Array, visible_QS: jax.Array | 
     return score_BNQS if visible_QS is None else jnp.where(visible_QS[None, None], score_BNQS, -jnp.inf)
 
 
-def _visible(queries: int, keys: int, first: int, block: int) -> jax.Array | None:
+def _visible(queries: int, keys: int, first: int, unit: int) -> jax.Array | None:
     """Bool [Q, S]: which keys each query of a run sees; None: all of them."""
-    if queries == block:
+    if queries == unit:
         return None
-    return ((first + jnp.arange(queries)) // block)[:, None] >= (jnp.arange(keys) // block)[None, :]
+    return ((first + jnp.arange(queries)) // unit)[:, None] >= (jnp.arange(keys) // unit)[None, :]
 
 
 def _product(spec: str, left: jax.Array, right: jax.Array) -> jax.Array:
     return jnp.einsum(spec, left, right, preferred_element_type=jnp.float32)
 
 
-def block_positions(
-    kind: Literal["flat", "grid"], time_T: jax.Array, block: int, grid: tuple[int, int] | None
+def token_positions(
+    kind: Literal["flat", "grid"], index_S: jax.Array, block: int, grid: tuple[int, int] | None
 ) -> jax.Array:
-    """Where the tokens of the blocks at times `time_T` stand: int32 [T * block, axes] (fidelity note 20).
+    """Where the tokens of index `index_S` in the stream stand: int32 [S, axes] (fidelity note 20).
 
     "flat": one axis, the token's index in the stream. "grid": (time, row, column), the action one step off the
     lower right corner; needs `grid` = (rows, columns) with rows * columns = block - 1, else ValueError.
     """
-    token_S = jnp.tile(jnp.arange(block), time_T.shape[0])
-    time_S = jnp.repeat(time_T, block)
     if kind == "flat":
-        return (time_S * block + token_S)[:, None]
+        return index_S[:, None]
     if grid is None or math.prod(grid) != block - 1:
         raise ValueError(f"grid positions need the rows and columns of {block - 1} tokens, not {grid}")
     rows, columns = grid
+    time_S, token_S = index_S // block, index_S % block
     action_S = token_S == block - 1
     row_S = jnp.where(action_S, rows, token_S // columns)
     column_S = jnp.where(action_S, columns, token_S % columns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -73,9 +74,9 @@ class Dream:
         turn_B = state.turn_B
         seat_B = None if turn_B is None else turn_B.seat
         stream_action_B = action_B if turn_B is None else stream_action(turn_B, action_B)
-        cache, hidden_BSD = self.model.step(state.cache, state.tokens_BL, stream_action_B)
-        tokens_BL = sample_next_tokens(
-            token_key, self.model.observation_logits(hidden_BSD), self.tokenizer.valid_codes(self.tokenizer_state)
+        valid_K = self.tokenizer.valid_codes(self.tokenizer_state)
+        cache, hidden_BSD, tokens_BL = next_frame(
+            token_key, self.model, state.cache, state.tokens_BL, stream_action_B, valid_K
         )
         reward_class_B = jax.random.categorical(reward_key, self.model.reward_logits(hidden_BSD, seat_B))
         terminated_B = jax.random.categorical(termination_key, self.model.termination_logits(hidden_BSD)) == 1
@@ -86,8 +87,49 @@ class Dream:
         return DreamState(cache, tokens_BL, turn_B), time_step
 
 
+def next_frame(
+    key: jax.Array, model: WorldModel, cache: Cache, tokens_BL: jax.Array, action_B: jax.Array, valid_K: jax.Array
+) -> tuple[Cache, jax.Array, jax.Array]:
+    """The cache with this frame and action, their hidden states [B, S, D], and the next frame's tokens [B, L]."""
+    cache, hidden_BSD = model.step(cache, tokens_BL, action_B)
+    if not model.config.block_teacher_forcing:
+        next_BL, _ = sample_one_by_one(key, model, cache, hidden_BSD[:, -1], valid_K)
+    elif model.token_size:
+        next_BL = jnp.clip(model.observation_logits(hidden_BSD), 0, 1)  # a regression's only guess
+    else:
+        next_BL = sample_next_tokens(key, model.observation_logits(hidden_BSD), valid_K)
+    return cache, hidden_BSD, next_BL
+
+
+def sample_one_by_one(
+    key: jax.Array, model: WorldModel, cache: Cache, action_hidden_BD: jax.Array, valid_K: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The next frame's tokens, int32 [B, L], each given those before it, and their log-probabilities [B, L] (Eq. 2).
+
+    The tokens enter a copy of the cache: `model.step` appends them again with the next action, all at once.
+    """
+
+    def sample(key: jax.Array, hidden_BD: jax.Array) -> tuple[jax.Array, jax.Array]:
+        logits_BK = model.observation_head(hidden_BD)
+        token_B1 = sample_next_tokens(key, logits_BK[:, None], valid_K)
+        log_BK = jax.nn.log_softmax(jnp.where(valid_K[None], logits_BK, -jnp.inf))
+        return token_B1[:, 0], jnp.take_along_axis(log_BK, token_B1, axis=1)[:, 0]
+
+    def following(carry: tuple[Cache, jax.Array], inputs: tuple[jax.Array, jax.Array]) -> Any:
+        (cache, token_B), (key, place) = carry, inputs
+        cache, hidden_BD = model.append_token(cache, token_B, place)
+        token_B, log_probability_B = sample(key, hidden_BD)
+        return (cache, token_B), (token_B, log_probability_B)
+
+    first_key, *_ = keys = jax.random.split(key, model.block - 1)
+    first_B, first_log_B = sample(first_key, action_hidden_BD)
+    _, (token_LB, log_LB) = jax.lax.scan(following, (cache, first_B), (keys[1:], jnp.arange(model.block - 2)))
+    token_BL = jnp.concatenate([first_B[None], token_LB]).swapaxes(0, 1)
+    return token_BL, jnp.concatenate([first_log_B[None], log_LB]).swapaxes(0, 1)
+
+
 def sample_next_tokens(key: jax.Array, logits_BLK: jax.Array, valid_K: jax.Array) -> jax.Array:
-    """int32 [B, L]: every token of the next frame, in parallel and independently, among the filled codes.
+    """int32 [B, L]: every token, in parallel and independently, among the filled codes.
 
     By inverting the cumulative distribution, which takes one random number per token. Adding noise to every logit takes
     K of them, and on a CPU six times as long as this (K = 512).

@@ -1,7 +1,8 @@
-"""One gradient step of the world model: block teacher forcing and its losses (Section 3.6, Appendix A.2.2)."""
+"""One gradient step of the world model: teacher forcing, block by block or not, and its losses (Section 3.6, Appendix A.2.2)."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
@@ -16,6 +17,7 @@ from suite.world_model.heads import TurnLogits
 from suite.world_model.transformer import WorldModel
 
 CHUNK_LOGITS = 2**25  # observation logits held at once: 128 MiB
+SAME_PATCH = 0.75  # squared distance up to which a regressed patch counts as right: that of patches that share a code
 METRICS: tuple[str, ...] = (
     "loss",
     "observation_loss",
@@ -41,7 +43,7 @@ class Sequences:
     """B replayed sequences of T steps and T + 1 frames, their observations as tokens.
 
     Attributes:
-      tokens_BTL: int32 [B, T + 1, L].
+      tokens_BTL: int32 [B, T + 1, L], or float32 [B, T + 1, L, P] where tokens are vectors.
       action_BT: int32; taken at frame t.
       reward_BT: float32; what it earned.
       terminated_BT: bool; the episode ended there, and frame t + 1 belongs to the next one.
@@ -86,6 +88,8 @@ def losses(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The sum of three cross-entropies in nats, means over tokens or steps, and scalar metrics.
 
+    Of tokens that are vectors the first is the squared Euclidean distance; one within `SAME_PATCH` counts as accurate.
+
     Observation + `reward_weight` * (reward + termination); in a game + `turn_losses`. Sequences may cross episodes;
     with `mask_after_done` only what comes before an episode's end counts: all three losses up to it, but not the
     tokens, nor the turn, it leads to.
@@ -93,8 +97,15 @@ def losses(
     frame, following = sequences.tokens_BTL[:, :-1], sequences.tokens_BTL[:, 1:]
     hidden_BTSD = model(frame, sequences.action_BT, dropout_key)
     step_weight_BT, token_weight_BT = _weights(sequences, config.mask_after_done)
-    token_loss_BTL, correct_BTL = _token_losses(model, hidden_BTSD, following)
-    token_weight_BTL = jnp.broadcast_to(token_weight_BT[..., None], following.shape)
+    target_BTL, before_BTL = following, frame
+    if not config.block_teacher_forcing:  # changed is what differs from a frame before; the first has none
+        target_BTL = model.observation_targets(frame, following)
+        before_BTL = model.observation_targets(jnp.concatenate([frame[:, :1], frame[:, :-1]], axis=1), frame)
+    token_loss_BTL, correct_BTL = _token_losses(model, hidden_BTSD, target_BTL)
+    changed_BTL = (before_BTL != target_BTL).reshape(*token_loss_BTL.shape, -1).any(-1)
+    token_weight_BTL = model.observation_targets(
+        *(jnp.broadcast_to(weight[..., None], token_loss_BTL.shape) for weight in (step_weight_BT, token_weight_BT))
+    )
 
     reward_class_BT = spec.reward_to_class(sequences.reward_BT)
     turn_BT = sequences.turn_BT
@@ -106,7 +117,7 @@ def losses(
     metrics = {
         "observation_loss": _mean(token_loss_BTL, token_weight_BTL),
         "token_accuracy": _mean(correct_BTL, token_weight_BTL),
-        "changed_token_accuracy": _mean(correct_BTL, token_weight_BTL * (frame != following).astype(jnp.float32)),
+        "changed_token_accuracy": _mean(correct_BTL, token_weight_BTL * changed_BTL.astype(jnp.float32)),
         "reward_loss": _mean(reward_loss_BT, step_weight_BT),
         "reward_accuracy": _mean(reward_correct_BT, step_weight_BT),
         "termination_loss": _mean(termination_loss_BT, step_weight_BT),
@@ -185,17 +196,21 @@ def _token_losses(model: WorldModel, hidden_BTSD: jax.Array, target_BTL: jax.Arr
 
     @jax.checkpoint
     def chunk_losses(hidden: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return cross_entropy(model.observation_logits(hidden), target)
+        predicted = model.observation_logits(hidden)
+        if not model.token_size:
+            return cross_entropy(predicted, target)
+        distance = jnp.square(predicted - target).sum(-1)
+        return distance, (distance <= SAME_PATCH).astype(jnp.float32)
 
-    batch = target_BTL.shape[0]
-    logits = target_BTL[0].size * model.observation_head.bias.shape[0]
+    batch, tokens = target_BTL.shape[0], hidden_BTSD.shape[:2] + (model.block - 1,)
+    logits = math.prod(tokens[1:]) * model.observation_head.bias.shape[0]
     chunk = max(
         size for size in range(1, batch + 1) if batch % size == 0 and size * logits <= max(CHUNK_LOGITS, logits)
     )
     split = (hidden_BTSD, target_BTL)
     chunked = jax.tree.map(lambda x: x.reshape(batch // chunk, chunk, *x.shape[1:]), split)
     loss, correct = jax.lax.map(lambda pair: chunk_losses(*pair), chunked)
-    return loss.reshape(target_BTL.shape), correct.reshape(target_BTL.shape)
+    return loss.reshape(tokens), correct.reshape(tokens)
 
 
 def _weights(sequences: Sequences, mask_after_done: bool) -> tuple[jax.Array, jax.Array]:

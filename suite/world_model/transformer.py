@@ -1,8 +1,12 @@
 """The transformer world model: a GPT-2 over a stream of blocks [q_1 .. q_L, a] (Section 3.6, Appendix A.2.2).
 
-With block teacher forcing the output at q_t^i predicts q_{t+1}^i; the output at a_t predicts reward and termination,
-and in a two-player game who is next, what is then legal, and the probabilities of chance (Section 4.7, Appendix G).
-Shapes: B streams, T time steps, L tokens per frame, S = L + 1 tokens per block, D width, N heads, H = D / N.
+With block teacher forcing every token sees its whole own block, and the output at q_t^i predicts q_{t+1}^i. Without, a
+token sees itself and what came before, and the outputs at q_t^i and a_t predict q_t^{i+1} and q_{t+1}^1 (fidelity notes
+18 and 19): another mask, another shift of the targets, another sampler (`imagination.next_frame`), nothing else.
+The output at a_t predicts reward and termination, and in a two-player game who is next, what is then legal, and the
+probabilities of chance (Section 4.7, Appendix G).
+Shapes: B streams, T time steps, L tokens per frame, S = L + 1 tokens per block, D width, N heads, H = D / N. Where
+tokens are no codes but vectors (`TokenSpec.token_size`), arrays of them have a further last axis.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from jax.typing import DTypeLike
 
 from suite.config import WorldModelConfig
 from suite.interface.tokens import TokenSpec
-from suite.world_model.attention import block_causal_attention, block_positions, cached_attention, rope
+from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
 from suite.world_model.dropout import dropout
 from suite.world_model.heads import Head, TurnHead, TurnLogits
 
@@ -25,11 +29,11 @@ TERMINATION_CLASSES = 2
 
 @struct.dataclass
 class Cache:
-    """Keys and values of the blocks seen so far.
+    """Keys and values of the tokens seen so far.
 
     Attributes:
-      keys, values: [layers, B, N, length * S, H]; keys are rotated already.
-      index: int32 scalar; blocks filled. `length` steps fit; a further one would overwrite the last.
+      keys, values: [layers, B, N, tokens, H]; keys are rotated already.
+      index: int32 scalar; tokens filled. One that does not fit any more would overwrite the last.
     """
 
     keys: jax.Array
@@ -86,6 +90,7 @@ class WorldModel(nnx.Module):
 
     Attributes:
       block: S, tokens per time step (the frame's L and the action).
+      unit: tokens that see one another: a block, or a token.
       dtype: of the matrix products and the cache; parameters, norms, softmax, residuals and logits are float32.
     """
 
@@ -93,15 +98,21 @@ class WorldModel(nnx.Module):
         width = config.embed_dim
         self.config, self.grid = config, grid
         self.block = tokens.tokens_per_frame + 1
+        self.unit = self.block if config.block_teacher_forcing else 1
         self.dtype = jnp.bfloat16 if config.compute_type == "bfloat16" else jnp.float32
         self.codes_per_place = tokens.num_codes if tokens.placed else 0
         codes = tokens.num_codes * (tokens.tokens_per_frame if tokens.placed else 1)
         init = nnx.initializers.normal(config.initial_std)
-        self.token_embedding = nnx.Embed(codes, width, embedding_init=init, rngs=rngs)
+        self.token_size = tokens.token_size
+        self.token_embedding: nnx.Embed | nnx.Linear = (
+            nnx.Linear(tokens.token_size, width, dtype=self.dtype, kernel_init=init, rngs=rngs)
+            if tokens.token_size
+            else nnx.Embed(codes, width, embedding_init=init, rngs=rngs)
+        )
         self.action_embedding = nnx.Embed(tokens.num_actions, width, embedding_init=init, rngs=rngs)
         self.layers = _stacked_layers(config, self.dtype, rngs)
         self.norm = layer_norm(width, rngs)
-        self.observation_head = Head(config, tokens.num_codes, self.dtype, rngs)
+        self.observation_head = Head(config, tokens.token_size or tokens.num_codes, self.dtype, rngs)
         self.seats = 2 if tokens.two_player else 1
         self.reward_head = Head(config, self.seats * len(tokens.reward_classes), self.dtype, rngs)
         self.termination_head = Head(config, TERMINATION_CLASSES, self.dtype, rngs)
@@ -113,7 +124,7 @@ class WorldModel(nnx.Module):
         rate = self.config.dropout
         embedding_key, layer_key = _split(dropout_key, 2)
         x = self._embed(tokens_BTL, action_BT).reshape(batch, steps * self.block, -1)
-        position_SA = block_positions(self.config.positions, jnp.arange(steps), self.block, self.grid)
+        position_SA = self._positions(jnp.arange(steps * self.block))
         graphdef, layers = nnx.split(self.layers)
 
         def run_layer(x: jax.Array, inputs: tuple[nnx.State, jax.Array]) -> tuple[jax.Array, None]:
@@ -122,11 +133,12 @@ class WorldModel(nnx.Module):
             key = None if layer_key is None else jax.random.fold_in(layer_key, index)
             attention_key, residual_key = _split(key, 2)
             query, key_, value = layer.attention_inputs(x)
-            attended = block_causal_attention(
+            attended = causal_attention(
                 rope(query, position_SA),
                 rope(key_, position_SA),
                 value,
                 block=self.block,
+                unit=self.unit,
                 dropout_rate=rate,
                 dropout_key=attention_key,
             )
@@ -138,8 +150,22 @@ class WorldModel(nnx.Module):
         return self.norm(x).reshape(batch, steps, self.block, -1)
 
     def observation_logits(self, hidden: jax.Array) -> jax.Array:
-        """float32 [B, T, L, K]: of q_{t+1} at each q_t, from hidden states [B, T, S, D] (or without the T axis)."""
-        return self.observation_head(hidden[..., :-1, :])
+        """float32 [B, T, L, K]: of `observation_targets`, from hidden states [B, T, S, D] (or without the T axis).
+
+        Where tokens are vectors these are the predicted tokens themselves, K numbers each.
+        """
+        if self.config.block_teacher_forcing:
+            return self.observation_head(hidden[..., :-1, :])
+        return self.observation_head(jnp.concatenate([hidden[..., :-2, :], hidden[..., -1:, :]], axis=-2))
+
+    def observation_targets(self, frame: jax.Array, following: jax.Array) -> jax.Array:
+        """What `observation_logits` are of: the following frame, or the rest of this one and that one's first token.
+
+        Arguments and result: [..., L], of tokens or of anything else that there is one of for each.
+        """
+        if self.config.block_teacher_forcing:
+            return following
+        return jnp.concatenate([frame[..., 1:], following[..., :1]], axis=-1)
 
     def reward_logits(self, hidden: jax.Array, seat: jax.Array | None = None) -> jax.Array:
         """float32 [B, T, R]: of the reward's class, from hidden states [B, T, S, D] (or without the T axis).
@@ -162,16 +188,28 @@ class WorldModel(nnx.Module):
         return self.turn_head(hidden[..., -1, :])
 
     def init_cache(self, batch: int, length: int) -> Cache:
-        """An empty cache for `length` steps of `batch` streams."""
+        """An empty cache for `length` steps of `batch` streams, and the tokens of the frame that the last leads to."""
         heads, width = self.config.heads, self.config.embed_dim
-        shape = (self.config.layers, batch, heads, length * self.block, width // heads)
+        blocks = length if self.config.block_teacher_forcing else length + 1
+        shape = (self.config.layers, batch, heads, blocks * self.block, width // heads)
         return Cache(jnp.zeros(shape, self.dtype), jnp.zeros(shape, self.dtype), jnp.int32(0))
 
     def step(self, cache: Cache, tokens_BL: jax.Array, action_B: jax.Array) -> tuple[Cache, jax.Array]:
         """Appends one block to the cache; its hidden states [B, S, D] equal those of the whole sequence's pass."""
-        x = self._embed(tokens_BL, action_B)
-        start = cache.index * self.block
-        position_SA = block_positions(self.config.positions, cache.index[None], self.block, self.grid)
+        return self._append(cache, self._embed(tokens_BL, action_B))
+
+    def append_token(self, cache: Cache, token_B: jax.Array, place: jax.Array) -> tuple[Cache, jax.Array]:
+        """Appends one token of a frame, the one at `place` (int32 scalar) of L; its hidden state [B, D]."""
+        assert isinstance(self.token_embedding, nnx.Embed)
+        cache, hidden_B1D = self._append(cache, self.token_embedding(token_B + place * self.codes_per_place)[:, None])
+        return cache, hidden_B1D[:, 0]
+
+    def _append(self, cache: Cache, x_BQD: jax.Array) -> tuple[Cache, jax.Array]:
+        """Appends embedded tokens, whole units of them."""
+        start = cache.index
+        index_Q = start + jnp.arange(x_BQD.shape[1])
+        last_Q = (index_Q // self.unit + 1) * self.unit - 1
+        position_SA = self._positions(index_Q)
         graphdef, layers = nnx.split(self.layers)
 
         def append(cached: jax.Array, new_BSNH: jax.Array, index: jax.Array) -> jax.Array:
@@ -183,12 +221,15 @@ class WorldModel(nnx.Module):
             layer = nnx.merge(graphdef, params)
             query, key, value = layer.attention_inputs(x)
             keys, values = append(keys, rope(key, position_SA), index), append(values, value, index)
-            attended = cached_attention(rope(query, position_SA), keys[index], values[index], start + self.block)
+            attended = cached_attention(rope(query, position_SA), keys[index], values[index], last_Q)
             return (layer.add(x, attended, None), keys, values), None
 
-        carry = (x, cache.keys, cache.values)
+        carry = (x_BQD, cache.keys, cache.values)
         (x, keys, values), _ = jax.lax.scan(run_layer, carry, (layers, jnp.arange(self.config.layers)))
-        return Cache(keys, values, cache.index + 1), self.norm(x)
+        return Cache(keys, values, start + x_BQD.shape[1]), self.norm(x)
+
+    def _positions(self, index_S: jax.Array) -> jax.Array:
+        return token_positions(self.config.positions, index_S, self.block, self.grid)
 
     def _embed(self, tokens: jax.Array, action: jax.Array) -> jax.Array:
         if self.codes_per_place:

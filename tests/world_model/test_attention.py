@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.world_model.attention import block_causal_attention, block_positions, cached_attention, rope
+from suite.world_model.attention import causal_attention, token_positions, cached_attention, rope
 
 
 def inputs(steps: int = 5, block: int = 7, heads: int = 2, width: int = 4) -> tuple[jax.Array, ...]:
@@ -13,27 +13,27 @@ def inputs(steps: int = 5, block: int = 7, heads: int = 2, width: int = 4) -> tu
     return tuple(jax.random.normal(key, (3, steps * block, heads, width)) for key in keys)
 
 
-def masked_attention(query, key, value, block: int) -> jax.Array:
+def masked_attention(query, key, value, unit: int) -> jax.Array:
     """The whole square, the plain way."""
     score = jnp.einsum("bqnh,bsnh->bnqs", query, key) / np.sqrt(query.shape[-1])
-    index = np.arange(query.shape[1]) // block
+    index = np.arange(query.shape[1]) // unit
     score = jnp.where((index[:, None] >= index[None])[None, None], score, -jnp.inf)
     return jnp.einsum("bnqs,bsnh->bqnh", jax.nn.softmax(score), value)
 
 
-@pytest.mark.parametrize("groups", [1, 2, 3, 5, 10])
-def test_groups_equal_the_fully_masked_square_and_its_gradient(groups):
+@pytest.mark.parametrize(("groups", "unit"), [(1, 7), (2, 7), (3, 7), (5, 7), (10, 7), (1, 1), (2, 1), (5, 1)])
+def test_groups_equal_the_fully_masked_square_and_its_gradient(groups, unit):
     query, key, value = inputs()
     weight = jax.random.normal(jax.random.key(1), value.shape)
 
     def ours(*qkv):
-        return (block_causal_attention(*qkv, block=7, groups=groups) * weight).sum()
+        return (causal_attention(*qkv, block=7, unit=unit, groups=groups) * weight).sum()
 
     def plain(*qkv):
-        return (masked_attention(*qkv, block=7) * weight).sum()
+        return (masked_attention(*qkv, unit) * weight).sum()
 
-    grouped = block_causal_attention(query, key, value, block=7, groups=groups)
-    np.testing.assert_allclose(grouped, masked_attention(query, key, value, 7), atol=1e-6)
+    grouped = causal_attention(query, key, value, block=7, unit=unit, groups=groups)
+    np.testing.assert_allclose(grouped, masked_attention(query, key, value, unit), atol=1e-6)
     for mine, theirs in zip(
         jax.grad(ours, (0, 1, 2))(query, key, value), jax.grad(plain, (0, 1, 2))(query, key, value), strict=True
     ):
@@ -47,19 +47,19 @@ def test_gradient_with_dropout_is_that_of_the_dropped_forward_pass():
 
     def loss(scale):
         moved = [x + scale * along for x, along in zip(qkv, direction, strict=True)]
-        dropped = block_causal_attention(*moved, block=7, dropout_rate=0.4, dropout_key=jax.random.key(3))
+        dropped = causal_attention(*moved, block=7, dropout_rate=0.4, dropout_key=jax.random.key(3))
         return (dropped * weight).sum()
 
     slope = (loss(1e-2) - loss(-1e-2)) / 2e-2
     np.testing.assert_allclose(jax.grad(loss)(0.0), slope, rtol=2e-3)
-    assert not np.allclose(loss(0.0), (masked_attention(*qkv, block=7) * weight).sum(), rtol=1e-2)
+    assert not np.allclose(loss(0.0), (masked_attention(*qkv, 7) * weight).sum(), rtol=1e-2)
 
 
 def test_dropout_keeps_the_expected_output():
     query, key, value = inputs(steps=2)
 
     def dropped(seed):
-        return block_causal_attention(query, key, value, block=7, dropout_rate=0.3, dropout_key=jax.random.key(seed))
+        return causal_attention(query, key, value, block=7, dropout_rate=0.3, dropout_key=jax.random.key(seed))
 
     mean = jax.vmap(dropped)(jnp.arange(4000)).mean(0)
     np.testing.assert_allclose(mean, masked_attention(query, key, value, 7), atol=0.06)
@@ -67,13 +67,13 @@ def test_dropout_keeps_the_expected_output():
 
 def test_large_scores_do_not_overflow():
     query, key, value = inputs(steps=2)
-    grads = jax.grad(lambda *qkv: block_causal_attention(*qkv, block=7).sum(), (0, 1, 2))(100 * query, 100 * key, value)
+    grads = jax.grad(lambda *qkv: causal_attention(*qkv, block=7).sum(), (0, 1, 2))(100 * query, 100 * key, value)
     assert all(np.isfinite(x).all() for x in grads)
 
 
 def test_cached_attention_sees_only_what_is_filled():
     query, key, value = inputs(steps=3)
-    mixed = cached_attention(query[:, 7:14], key.swapaxes(1, 2), value.swapaxes(1, 2), jnp.int32(14))
+    mixed = cached_attention(query[:, 7:14], key.swapaxes(1, 2), value.swapaxes(1, 2), jnp.full(7, 13))
     np.testing.assert_allclose(mixed, masked_attention(query, key, value, 7)[:, 7:14], atol=1e-6)
 
 
@@ -82,7 +82,7 @@ def test_rope_scores_depend_on_differences_of_positions_only(kind):
     query, key, _ = inputs(steps=3, width=8)
 
     def scores(shift):
-        position = block_positions(kind, jnp.arange(3) + shift, 7, (2, 3))
+        position = token_positions(kind, jnp.arange(21) + 7 * shift, 7, (2, 3))
         return jnp.einsum("bqnh,bsnh->bnqs", rope(query, position), rope(key, position))
 
     np.testing.assert_allclose(scores(0), scores(11), atol=2e-4)
@@ -100,9 +100,9 @@ def test_rope_rotates_by_the_position_and_keeps_the_length():
 
 
 def test_positions():
-    flat = block_positions("flat", jnp.asarray([0, 3]), 7, None)
-    np.testing.assert_array_equal(flat[:, 0], [*range(7), *range(21, 28)])
-    grid = block_positions("grid", jnp.asarray([4]), 7, (2, 3))
+    flat = token_positions("flat", jnp.asarray([3, 21]), 7, None)
+    np.testing.assert_array_equal(flat, [[3], [21]])
+    grid = token_positions("grid", 28 + jnp.arange(7), 7, (2, 3))
     np.testing.assert_array_equal(grid, [[4, 0, 0], [4, 0, 1], [4, 0, 2], [4, 1, 0], [4, 1, 1], [4, 1, 2], [4, 2, 3]])
     with pytest.raises(ValueError, match="rows and columns of 6 tokens"):
-        block_positions("grid", jnp.arange(2), 7, (2, 2))
+        token_positions("grid", jnp.arange(14), 7, (2, 2))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax
@@ -9,8 +10,10 @@ import optax
 import pytest
 from flax import nnx
 
+from suite.world_model.imagination import next_frame
 from suite.world_model.training import METRICS, WorldModelLearner, cross_entropy, losses, make_optimizer, update
-from tests.world_model.small import SPEC, random_sequences, small_config, small_model
+from suite.world_model.transformer import WorldModel
+from tests.world_model.small import GRID, SPEC, random_sequences, small_config, small_model
 
 SEQUENCES = random_sequences()
 
@@ -123,3 +126,26 @@ def test_dropout_follows_the_key():
     model = small_model(std=0.2, dropout=0.3)
     values = [losses(model, SEQUENCES, config, SPEC, key)[0] for key in (None, jax.random.key(0), jax.random.key(1))]
     assert len({float(value) for value in values}) == 3
+
+
+def test_vectors_are_regressed():
+    """Tokens of three numbers: the loss is the squared distance, and sampling is the prediction."""
+    spec = dataclasses.replace(SPEC, num_codes=0, token_size=3)
+    config = small_config()
+    model = WorldModel(config, spec, GRID, nnx.Rngs(0))
+    vectors = jax.random.uniform(jax.random.key(0), (*SEQUENCES.tokens_BTL.shape, 3))
+    vectors = vectors.at[:, 1].set(vectors[:, 0])
+    sequences = SEQUENCES.replace(tokens_BTL=vectors)
+    _, metrics = losses(model, sequences, config, spec)
+    predicted = model.observation_logits(model(vectors[:, :-1], sequences.action_BT))
+    distance = np.square(np.asarray(predicted - vectors[:, 1:])).sum(-1)
+    np.testing.assert_allclose(metrics["observation_loss"], distance.mean(), rtol=1e-5)
+    np.testing.assert_allclose(metrics["token_accuracy"], (distance <= 0.75).mean(), rtol=1e-5)
+    np.testing.assert_allclose(metrics["changed_token_accuracy"], (distance[:, 1:] <= 0.75).mean(), rtol=1e-5)
+
+    cache = model.init_cache(3, 5)
+    _, hidden, frame = next_frame(
+        jax.random.key(1), model, cache, vectors[:, 0], sequences.action_BT[:, 0], jnp.ones(0, bool)
+    )
+    np.testing.assert_array_equal(frame, jnp.clip(model.observation_logits(hidden), 0, 1))
+    assert frame.shape == (3, 6, 3)

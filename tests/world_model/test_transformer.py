@@ -51,10 +51,41 @@ def test_block_causality_by_gradients(positions):
         assert (slope_BTS[1:] == 0).all()
 
 
+def test_causality_without_block_teacher_forcing():
+    """The output at a token sees that token and those before it; logits are read where fidelity note 19 says."""
+    model = small_model(std=0.2, block_teacher_forcing=False)
+    embedding_BTSD = model._embed(TOKENS, ACTION)
+
+    def prediction(embedding, readout):
+        seen = small_model(std=0.2, block_teacher_forcing=False)
+        seen._embed = lambda tokens, action: embedding
+        return readout(seen, seen(TOKENS, ACTION))
+
+    def seen_by(readout):
+        return np.asarray(jnp.abs(jax.grad(prediction)(embedding_BTSD, readout)).max(-1) > 0)
+
+    reads = {  # (time, which of the L predictions): the last token it may see
+        (2, 0): 2 * 7,  # q_2^2, from the first token of frame 2
+        (2, 4): 2 * 7 + 4,  # q_2^6
+        (2, 5): 2 * 7 + 6,  # q_3^1, from the action: the last token of the frame predicts nothing
+    }
+    for (time, token), last in reads.items():
+        slope_BTS = seen_by(lambda model, hidden: model.observation_logits(hidden)[0, time, token, 1])  # noqa: B023
+        assert not slope_BTS[1:].any()
+        np.testing.assert_array_equal(slope_BTS[0].ravel(), np.arange(5 * 7) <= last)
+    np.testing.assert_array_equal(
+        seen_by(lambda model, hidden: model.reward_logits(hidden)[0, time, 1])[0].ravel(), np.arange(5 * 7) < 3 * 7
+    )
+    targets = model.observation_targets(TOKENS[:, :-1], TOKENS[:, 1:])
+    np.testing.assert_array_equal(targets[:, :, :5], TOKENS[:, :-1, 1:])
+    np.testing.assert_array_equal(targets[:, :, 5], TOKENS[:, 1:, 0])
+
+
+@pytest.mark.parametrize("blocks", [True, False])
 @pytest.mark.parametrize("positions", ["flat", "grid"])
 @pytest.mark.parametrize("compute_type", ["float32", "bfloat16"])
-def test_cached_logits_equal_uncached_ones(positions, compute_type):
-    model = small_model(std=0.2, positions=positions, compute_type=compute_type)
+def test_cached_logits_equal_uncached_ones(positions, compute_type, blocks):
+    model = small_model(std=0.2, positions=positions, compute_type=compute_type, block_teacher_forcing=blocks)
     tolerance = 1e-5 if compute_type == "float32" else 5e-2
     hidden_BTSD = model(TOKENS, ACTION)
     cache, step = model.init_cache(3, 5), jax.jit(model.step)
@@ -64,7 +95,7 @@ def test_cached_logits_equal_uncached_ones(positions, compute_type):
         for logits in (model.observation_logits, model.reward_logits, model.termination_logits):
             expected = logits(hidden_BTSD)[:, time]
             np.testing.assert_allclose(logits(hidden_BSD), expected, atol=tolerance * float(jnp.abs(expected).max()))
-    assert int(cache.index) == 5
+    assert int(cache.index) == 5 * 7
 
 
 def test_bfloat16_is_close_to_float32():
