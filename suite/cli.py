@@ -186,7 +186,11 @@ def _list(args: argparse.Namespace) -> int:
         raise UserError(f"cannot list {args.what!r}; {did_you_mean(args.what, LISTS)}")
     entries: dict[str, Any] = getattr(registry, args.what)()
     rows = {
-        id: [part for part in (entry.summary, getattr(entry, "cost", ""), getattr(entry, "published", "")) if part]
+        id: [
+            part
+            for part in (entry.summary, *(getattr(entry, name, "") for name in ("row", "cost", "published")))
+            if part
+        ]
         for id, entry in entries.items()
     }
     if args.json:
@@ -220,7 +224,8 @@ def _describe(args: argparse.Namespace) -> int:
             ]
             for layer in modules_layers
         )
-    counted = [f"{name.replace('_', ' ')} {description.parameters(name):,}" for name in ("policy", "world_model")]
+    networks = [name for name in description.modules if name != "codebook"]
+    counted = [f"{name.replace('_', ' ')} {description.parameters(name):,}" for name in networks]
     counted.append(f"2 x codebook {description.parameters('codebook'):,} (stored twice in the paper's bookkeeping)")
     print(f"\nTotal: {description.total:,}{' = ' + ' + '.join(counted) if 'codebook' in description.modules else ''}")
     print("\nDerived")

@@ -56,13 +56,14 @@ class EnvironmentConfig:
 class PolicyConfig:
     """Actor-critic network (Appendix A.1.1; sizes as the fidelity notes' parameter table)."""
 
-    kind: Literal["actor_critic", "uniform"] = "actor_critic"
+    kind: Literal["actor_critic", "moon", "uniform"] = "actor_critic"  # moon: that of Moon et al. (note 36)
     cnn_channels: tuple[Positive, ...] = (64, 128, 128)  # one Impala stack each; the literal text: (64, 64, 128)
     blocks_per_stack: Positive = 2
     convs_per_block: Positive = 2  # the literal text: 1
     max_pixels: Positive = 63  # larger frames are resized to this height and width, nearest pixel (note 4)
     cnn_norm: Literal["instance", "batch", "layer"] = "instance"  # note 1
     activation: Literal["relu", "swish"] = "relu"  # inside the CNN
+    embedding_size: NotNegative = 0  # the CNN's output is mapped to so many numbers; 0: it stays as it is
     rnn_size: NotNegative = 256  # 0: no memory
     hidden_size: Positive = 2048
     dense_blocks: NotNegative = 2
@@ -81,6 +82,8 @@ class PPOConfig:
     entropy_coefficient: NotNegativeFloat = 0.01  # lambda_ent, on real play
     target_decay: Rate = 0.95  # alpha: moving averages that standardise the value targets (note 8)
     target_min_std: PositiveFloat = 0.1
+    # What is averaged for their spread: each minibatch's deviation, or the mean square (Moon et al., note 36).
+    target_spread: Literal["deviation", "mean_square"] = "deviation"
     learning_rate: PositiveFloat = 4.5e-4
     anneal_learning_rate: bool = False  # linear to 0 over the budget: MFRL only (note 11)
     adam_eps: PositiveFloat = 1e-5
@@ -101,11 +104,18 @@ class ReplayConfig:
 class TokenizerConfig:
     """From observations to tokens (Section 3.5, Appendix A.2.1)."""
 
-    kind: Literal["nearest_neighbor"] = "nearest_neighbor"
+    # Learned: vq_vae (whole frames; M1, M2), patch_vq_vae (M3). continuous: patches are not quantized but regressed.
+    kind: Literal["nearest_neighbor", "vq_vae", "patch_vq_vae", "continuous"] = "nearest_neighbor"
     codebook_size: Positive = 4096  # K
     threshold: NotNegativeFloat = 0.75  # tau, on the squared distance of patches in [0, 1] (note 13)
-    patch: tuple[Positive, Positive] | None = None  # None: the task's natural patch
+    patch: tuple[Positive, Positive] | None = None  # None: the task's natural patch; the frame is padded to fill (37)
     updates: NotNegative = 25  # N_tok, each of `world_model.minibatches` minibatches
+    # The rest belongs to the VQ-VAEs (note 15).
+    embed_dim: Positive = 128  # of codes and latents, both of unit norm
+    channels: Annotated[tuple[Positive, ...], Field(min_length=5, max_length=5)] = (64, 64, 128, 128, 256)
+    # lambda 1 to 4 of Eq. 3: absolute error, squared error, codebook, commitment
+    loss_weights: tuple[NotNegativeFloat, NotNegativeFloat, NotNegativeFloat, NotNegativeFloat] = (1.0, 0.0, 1.0, 0.25)
+    learning_rate: PositiveFloat = 1e-3
 
 
 @config_class
@@ -250,6 +260,10 @@ def _problems(config: Config) -> Iterator[str]:
         )
     if (model.embed_dim // model.heads) % 2:
         yield f"world_model.embed_dim / world_model.heads = {model.embed_dim / model.heads:g} must be even (RoPE)"
+    if config.policy.kind == "moon" and (config.policy.rnn_size or not config.policy.embedding_size):
+        yield "policy.kind=moon has no memory and an embedding: policy.rnn_size=0, and policy.embedding_size above 0"
+    if config.tokenizer.kind == "continuous" and not model.block_teacher_forcing:
+        yield "tokenizer.kind=continuous needs world_model.block_teacher_forcing=true: one by one only codes are sampled"
     if config.protocol.steps < config.steps_per_iteration:
         yield (
             f"protocol.steps={config.protocol.steps} is less than one iteration of "

@@ -20,6 +20,7 @@ from suite.interface.environment import EnvironmentSpec
 from suite.overrides import dotted
 from suite.policy.actor_critic import make_policy
 from suite.registry import Source
+from suite.tokenizers.vq_vae import VQState
 from suite.world_model.transformer import WorldModel
 
 MORE = "; more, as chance's events do not count"
@@ -52,7 +53,7 @@ class Description:
 
     Attributes:
       settings: every field.
-      modules: layers by module: "policy", "world_model", "codebook".
+      modules: layers by module: "policy", "world_model", "tokenizer" (networks of a VQ-VAE), "codebook".
       derived: what follows from the settings: name, value, how.
     """
 
@@ -66,8 +67,8 @@ class Description:
 
     @property
     def total(self) -> int:
-        """Of policy and world model and, as the paper counts it, twice the codebook (fidelity notes, first table)."""
-        return self.parameters("policy") + self.parameters("world_model") + 2 * self.parameters("codebook")
+        """Of all networks and, as the paper counts it, twice the codebook (fidelity notes, first table)."""
+        return sum(map(self.parameters, self.modules)) + self.parameters("codebook")
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
@@ -92,8 +93,7 @@ def describe(layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec) -> 
         tokenizer, tokens, grid = build_tokenizer(config, spec)
         world_model = nnx.eval_shape(lambda: WorldModel(config.world_model, tokens, grid, nnx.Rngs(0)))
         modules["world_model"] = _layers(world_model)
-        if codebook := _group(jax.eval_shape(tokenizer.init, jax.random.key(0))):
-            modules["codebook"] = codebook
+        modules |= _tokenizer_modules(jax.eval_shape(tokenizer.init, jax.random.key(0)))
     return Description(_settings(layers), modules, _derived(config, spec))
 
 
@@ -103,6 +103,16 @@ def _settings(layers: Sequence[tuple[Source, Config]]) -> list[Setting]:
     for (_, before), (source, after) in itertools.pairwise(fields):
         origin |= {name: source for name in after if after[name] != before[name]}
     return [Setting(name, value, origin[name]) for name, value in fields[-1][1].items()]
+
+
+def _tokenizer_modules(state: Any) -> dict[str, list[Layer]]:
+    """The networks, if it has any, and the codebook, if there is one; an optimizer's state is no parameter."""
+    if isinstance(state, VQState):
+        networks = nnx.to_pure_dict(state.params)
+        state = {"codebook": networks.pop("codebook")}
+        return {"tokenizer": _group(networks), "codebook": _group(state)}
+    codebook = _group(state)
+    return {"codebook": codebook} if codebook else {}
 
 
 def _layers(module: nnx.Module) -> list[Layer]:

@@ -59,6 +59,9 @@ class TaskEntry:
       presets: by name, functions `Config -> Config`; they see the agent's id in `config.agent`.
       own_auto_reset: the batched environment, made from a number of environments, that resets as the package itself
         does; for `suite bench` only. None: it has no auto-reset.
+      symbols: a function from an environment's state to what its frame shows, int32 [R], for `suite inspect`; None: what
+        it shows is not known.
+      symbol_values: how many values a symbol has.
       cost: what a run takes, in words.
     """
 
@@ -70,6 +73,8 @@ class TaskEntry:
     scores: Lazy
     presets: Mapping[str, Lazy]
     own_auto_reset: Lazy | None = None
+    symbols: Lazy | None = None
+    symbol_values: int = 0
     cost: str = ""
 
 
@@ -78,12 +83,14 @@ class AgentEntry:
     """An agent: a function `Config -> Config` that states what defines it.
 
     Attributes:
+      row: where the paper reports it, "" if nowhere.
       published: reward and score in percent as published for Craftax-classic at 1M steps, "" if there are none.
     """
 
     id: str
     configure: Lazy
     summary: str
+    row: str = ""
     published: str = ""
 
 
@@ -155,6 +162,8 @@ TASKS = (
             "smoke": Lazy("baselines.presets:craftax_classic_smoke"),
         },
         own_auto_reset=Lazy("adapters.craftax:BuiltInAutoReset"),
+        symbols=Lazy("adapters.craftax_symbols:classic_symbols"),
+        symbol_values=17,
         cost="small on two CPU cores: m5 6 min, mfrl 2 min, random 15 s, 2.3 GiB; paper: an accelerator",
     ),
 )
@@ -165,19 +174,134 @@ AGENTS = (
         "mfrl",
         Lazy("baselines.model_free:mfrl"),
         "PPO with a GRU on real play only",
-        published="reward 55.49 +- 1.33 %, score 16.77 +- 1.11 %",
+        "Table 1, Our best MFRL",
+        "reward 55.49 +- 1.33 %, score 16.77 +- 1.11 %",
+    ),
+    AgentEntry(
+        "mfrl_no_rnn",
+        Lazy("baselines.model_free:mfrl_no_rnn"),
+        "mfrl without the GRU",
+        "Table 2, Remove RNN",
+        "reward 41.82 +- 0.97 %, score 8.33 +- 0.44 %",
+    ),
+    AgentEntry(
+        "mfrl_small",
+        Lazy("baselines.model_free:mfrl_small"),
+        "mfrl with a smaller network",
+        "Table 2, Smaller model",
+        "reward 51.35 +- 0.80 %, score 12.93 +- 0.56 %",
+    ),
+    AgentEntry(
+        "mfrl_prior",
+        Lazy("baselines.model_free:mfrl_prior"),
+        "the PPO of Moon et al. (2023), no memory",
+        "Table 1, Previous best MFRL",
+        "reward 47.40 +- 0.58 %, score 10.71 +- 0.29 %",
+    ),
+    AgentEntry(
+        "m1",
+        Lazy("baselines.ladder:m1"),
+        "VQ-VAE, token by token, imagination only",
+        "Table 1, M1: Baseline",
+        "reward 31.93 +- 2.22 %, score 4.98 +- 0.50 %",
+    ),
+    AgentEntry(
+        "m2",
+        Lazy("baselines.ladder:m2"),
+        "m1 that learns from real play too (Dyna)",
+        "Table 1, M2: M1 + Dyna",
+        "reward 43.36 +- 1.84 %, score 8.85 +- 0.63 %",
+    ),
+    AgentEntry(
+        "m3",
+        Lazy("baselines.ladder:m3"),
+        "m2 with a VQ-VAE of patches",
+        "Table 1, M3: M2 + patches",
+        "reward 58.92 +- 1.03 %, score 19.36 +- 1.42 %",
+    ),
+    AgentEntry(
+        "m4",
+        Lazy("baselines.ladder:m4"),
+        "m3 with nearest-neighbor tokens",
+        "Table 1, M4: M3 + NNT",
+        "reward 64.96 +- 1.13 %, score 25.55 +- 0.86 %",
     ),
     AgentEntry(
         "m5",
         Lazy("baselines.ladder:m5"),
-        "PPO on real and imagined play: nearest-neighbor tokens, block teacher forcing",
-        published="reward 67.42 +- 0.55 %, score 27.91 +- 0.63 %",
+        "m4 with block teacher forcing",
+        "Table 1, M5: M4 + BTF (fast)",
+        "reward 67.42 +- 0.55 %, score 27.91 +- 0.63 %",
     ),
     AgentEntry(
         "m5_slow",
         Lazy("baselines.ladder:m5_slow"),
         "m5 with eight times the world-model updates",
-        published="reward 69.66 +- 1.20 %, score 31.77 +- 1.43 %",
+        "Table 1, M5: M4 + BTF (slow)",
+        "reward 69.66 +- 1.20 %, score 31.77 +- 1.43 %",
+    ),
+    AgentEntry(
+        "m5_patch5",
+        Lazy("baselines.ablations:m5_patch5"),
+        "m5 on patches of 5x5",
+        "Table 2, 5x5 quantized",
+        "reward 57.28 +- 1.14 %, score 18.26 +- 1.18 %",
+    ),
+    AgentEntry(
+        "m5_patch9",
+        Lazy("baselines.ablations:m5_patch9"),
+        "m5 on patches of 9x9",
+        "Table 2, 9x9 quantized",
+        "reward 45.55 +- 0.88 %, score 10.12 +- 0.40 %",
+    ),
+    AgentEntry(
+        "m5_continuous",
+        Lazy("baselines.ablations:m5_continuous"),
+        "m5 that regresses patches",
+        "Table 2, 7x7 continuous",
+        "reward 21.20 +- 0.55 %, score 2.43 +- 0.09 %",
+    ),
+    AgentEntry(
+        "m5_no_dyna",
+        Lazy("baselines.ablations:m5_no_dyna"),
+        "m5 that learns from imagination only",
+        "Table 2, Remove Dyna",
+        "reward 55.02 +- 5.34 %, score 18.79 +- 2.14 %",
+    ),
+    AgentEntry(
+        "m5_no_nnt",
+        Lazy("baselines.ablations:m5_no_nnt"),
+        "m5 with a VQ-VAE of patches",
+        "Table 2, Remove NNT",
+        "reward 60.66 +- 1.38 %, score 21.79 +- 1.33 %",
+    ),
+    AgentEntry(
+        "m5_no_nnt_no_patches",
+        Lazy("baselines.ablations:m5_no_nnt_no_patches"),
+        "m5 with a VQ-VAE of frames",
+        "Table 2, Remove NNT & patches",
+        "reward 45.86 +- 1.42 %, score 10.36 +- 0.69 %",
+    ),
+    AgentEntry(
+        "m5_no_btf",
+        Lazy("baselines.ablations:m5_no_btf"),
+        "the same as m4",
+        "Table 2, Remove BTF",
+        "reward 64.96 +- 1.13 %, score 25.55 +- 0.86 %",
+    ),
+    AgentEntry(
+        "m5_tbp0",
+        Lazy("baselines.ablations:m5_tbp0"),
+        "m5 that imagines from the start",
+        "Table 2, Use T_BP = 0",
+        "reward 33.54 +- 10.09 %, score 12.86 +- 4.05 %",
+    ),
+    AgentEntry(
+        "m5_annealed",
+        Lazy("baselines.ablations:m5_annealed"),
+        "m5 whose imagined updates grow linearly",
+        "Appendix C, annealing",
+        "reward 65.71 +- 1.11 %",
     ),
 )
 

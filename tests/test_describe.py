@@ -31,6 +31,30 @@ def test_counts_are_the_papers(m5):
     assert m5.as_dict()["parameters"]["total"] == 58_503_964
 
 
+@pytest.mark.parametrize(
+    ("agent", "total", "millions"),
+    [
+        ("m1", 60_032_287, 60.0),
+        ("m2", 60_032_287, 60.0),
+        ("m3", 56_564_143, 56.6),
+        ("m4", 58_503_964, 58.5),
+        ("mfrl", 55_599_768, 55.6),
+        ("mfrl_prior", 3_951_122, 4.0),
+    ],
+)
+def test_each_rungs_count_is_the_papers(agent, total, millions):
+    """Table 1, and the fidelity notes' table of parameter counts."""
+    found = described(agent).total
+    assert found == total and round(found / 1e6, 1) == millions
+
+
+def test_a_vq_vae_counts_networks_once_and_its_codebook_twice():
+    m3 = described("m3")
+    assert m3.parameters("tokenizer") == (147 * 128 + 128) + (128 * 128 + 128) + (128 * 147 + 147)
+    assert shapes(m3, "codebook") == {".codebook": (512, 128)}
+    assert m3.parameters("world_model") == 778_884
+
+
 def test_sizes_are_the_papers(m5):
     """Table "MFRL hyperparameters", sizes: CNN output 8x8x128, actor-critic input 8448."""
     policy = shapes(m5, "policy")

@@ -8,16 +8,42 @@ from suite import registry
 from suite.errors import UserError
 from suite.registry import AgentEntry, Lazy
 
-PUBLISHED = {  # Table "best scores": reward, score
+PUBLISHED = {  # Tables 1 and 2: reward, score
     "mfrl": ("55.49 +- 1.33 %", "16.77 +- 1.11 %"),
+    "mfrl_no_rnn": ("41.82 +- 0.97 %", "8.33 +- 0.44 %"),
+    "mfrl_small": ("51.35 +- 0.80 %", "12.93 +- 0.56 %"),
+    "mfrl_prior": ("47.40 +- 0.58 %", "10.71 +- 0.29 %"),
+    "m1": ("31.93 +- 2.22 %", "4.98 +- 0.50 %"),
+    "m2": ("43.36 +- 1.84 %", "8.85 +- 0.63 %"),
+    "m3": ("58.92 +- 1.03 %", "19.36 +- 1.42 %"),
+    "m4": ("64.96 +- 1.13 %", "25.55 +- 0.86 %"),
     "m5": ("67.42 +- 0.55 %", "27.91 +- 0.63 %"),
     "m5_slow": ("69.66 +- 1.20 %", "31.77 +- 1.43 %"),
+    "m5_patch5": ("57.28 +- 1.14 %", "18.26 +- 1.18 %"),
+    "m5_patch9": ("45.55 +- 0.88 %", "10.12 +- 0.40 %"),
+    "m5_continuous": ("21.20 +- 0.55 %", "2.43 +- 0.09 %"),
+    "m5_no_dyna": ("55.02 +- 5.34 %", "18.79 +- 2.14 %"),
+    "m5_no_nnt": ("60.66 +- 1.38 %", "21.79 +- 1.33 %"),
+    "m5_no_nnt_no_patches": ("45.86 +- 1.42 %", "10.36 +- 0.69 %"),
+    "m5_no_btf": ("64.96 +- 1.13 %", "25.55 +- 0.86 %"),
+    "m5_tbp0": ("33.54 +- 10.09 %", "12.86 +- 4.05 %"),
 }
 
 
 def test_published_numbers():
-    for id, (reward, score) in PUBLISHED.items():
-        assert registry.agent(id).published == f"reward {reward}, score {score}"
+    published = {id: f"reward {reward}, score {score}" for id, (reward, score) in PUBLISHED.items()}
+    published |= {"m5_annealed": "reward 65.71 +- 1.11 %", "random": ""}  # Section 4.3 gives no score
+    assert {id: entry.published for id, entry in registry.agents().items()} == published
+    assert all(
+        entry.row.startswith(("Table ", "Appendix ")) for id, entry in registry.agents().items() if id != "random"
+    )
+
+
+def test_docstrings_name_the_published_numbers():
+    for id, entry in registry.agents().items():
+        text = entry.configure().__doc__
+        for number in entry.published.replace("reward ", "").replace("score ", "").split(", "):
+            assert number.removesuffix(" %") in text, id
 
 
 def test_everything_registered_can_be_imported():
@@ -35,7 +61,7 @@ def test_everything_registered_can_be_imported():
     [
         (("craftax_clasic", "m5", "paper"), "unknown task 'craftax_clasic'; did you mean 'craftax_classic'?"),
         (("craftax_classic", "mrfl", "paper"), "unknown agent 'mrfl'; did you mean 'mfrl'?"),
-        (("craftax_classic", "zzz", "paper"), "unknown agent 'zzz'; valid: m5, m5_slow, mfrl, random"),
+        (("craftax_classic", "zzz", "paper"), f"unknown agent 'zzz'; valid: {', '.join(sorted(registry.agents()))}"),
         (("craftax_classic", "m5", "papr"), "unknown preset 'papr'; did you mean 'paper'?"),
     ],
 )

@@ -19,7 +19,7 @@ from suite.agent.replay import Replay, ReplayState
 from suite.config import Config
 from suite.interface.batching import Batched
 from suite.interface.environment import Environment, EnvironmentSpec
-from suite.interface.tokens import TokenizerState, TokenSpec, encode_frame
+from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec, encode_frame
 from suite.interface.turns import stream_action
 from suite.policy import ppo
 from suite.policy.actor_critic import make_policy
@@ -49,7 +49,7 @@ class TrainState:
     world_model: world_model_training.WorldModelLearner | None = None
 
 
-def build_tokenizer(config: Config, spec: EnvironmentSpec) -> tuple[Any, TokenSpec, tuple[int, int]]:
+def build_tokenizer(config: Config, spec: EnvironmentSpec) -> tuple[Tokenizer, TokenSpec, tuple[int, int]]:
     """The tokenizer, the token stream it makes for the world model, and the frame's (rows, columns) of tokens."""
     tokenizer = make_tokenizer(config.tokenizer, spec.observation)
     rows, columns = tokenizer.grid
@@ -62,6 +62,7 @@ def build_tokenizer(config: Config, spec: EnvironmentSpec) -> tuple[Any, TokenSp
         placed=spec.observation.kind == "symbols" and config.world_model.symbol_places,
         player_actions=spec.num_actions if spec.two_player else 0,
         chance_outcomes=spec.chance_outcomes,
+        token_size=tokenizer.token_size,
     )
     return tokenizer, tokens, (players * rows, columns)
 

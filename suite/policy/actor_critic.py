@@ -11,6 +11,7 @@ from flax import nnx, struct
 
 from suite.config import PolicyConfig
 from suite.interface.environment import ObservationSpec
+from suite.policy.moon import MoonCNN, MoonTrunk
 from suite.policy.networks import GRU, RELU_GAIN, DenseTrunk, ImpalaCNN, Norm, SymbolMLP, dense
 
 # Finite, so that entropy and gradients stay finite; far enough for a probability of exactly zero.
@@ -33,7 +34,8 @@ class PolicyOutput:
 class ActorCritic(nnx.Module):
     """z = CNN(o); y, h = GRU(h, z); policy and value from [y, z] (Algorithm 2, fidelity note 2).
 
-    With `config.rnn_size` 0 there is no memory: h has size 0 and the heads see z alone.
+    With `config.rnn_size` 0 there is no memory: h has size 0 and the heads see z alone. `config.kind` "moon" is the
+    network of `suite.policy.moon` instead.
     """
 
     def __init__(self, config: PolicyConfig, observation: ObservationSpec, num_actions: int, rngs: nnx.Rngs):
@@ -41,7 +43,8 @@ class ActorCritic(nnx.Module):
         self.rnn_size, self.high, self.dtype = config.rnn_size, observation.high, dtype
         self.symbolic = observation.kind == "symbols"
         self.resized = None
-        self.embed: SymbolMLP | ImpalaCNN
+        moon = config.kind == "moon"
+        self.embed: SymbolMLP | ImpalaCNN | MoonCNN
         if self.symbolic:
             (symbols,) = observation.shape
             self.embed = SymbolMLP(symbols, observation.high + 1, config.hidden_size, dtype, rngs)
@@ -49,16 +52,19 @@ class ActorCritic(nnx.Module):
             height, width, channels = observation.shape
             if observation.kind == "pixels" and max(height, width) > config.max_pixels:
                 self.resized = (min(height, config.max_pixels), min(width, config.max_pixels))
-            self.embed = ImpalaCNN((*(self.resized or (height, width)), channels), config, dtype, rngs)
+            network = MoonCNN if moon else ImpalaCNN
+            self.embed = network((*(self.resized or (height, width)), channels), config, dtype, rngs)
         self.memory = Memory(self.embed.features, config.rnn_size, dtype, rngs) if config.rnn_size else None
 
         inputs = self.embed.features + config.rnn_size
         self.trunks = nnx.List(  # one that is shared, or the actor's and the critic's
-            DenseTrunk(inputs, config.hidden_size, config.dense_blocks, dtype, rngs)
-            for _ in range(1 if config.shared_trunk else 2)
+            MoonTrunk(inputs, config.hidden_size, dtype, rngs)
+            if moon
+            else DenseTrunk(inputs, config.hidden_size, config.dense_blocks, dtype, rngs)
+            for _ in range(1 if config.shared_trunk or moon else 2)
         )
         self.policy_head = dense(config.hidden_size, num_actions, 0.01, jnp.float32, rngs)
-        self.value_head = dense(config.hidden_size, 1, 1.0, jnp.float32, rngs)
+        self.value_head = dense(config.hidden_size, 1, 0.1 if moon else 1.0, jnp.float32, rngs)
 
     def initial_hidden(self, batch: int) -> jax.Array:
         """float32 zeros [batch, H]."""

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from suite.config import PolicyConfig
+from suite.convolution import convolve
 
 Initializer = Callable[..., jax.Array]
 
@@ -29,53 +30,6 @@ _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {"relu": jax.nn.relu
 def dense(inputs: int, outputs: int, gain: float, dtype: Any, rngs: nnx.Rngs) -> nnx.Linear:
     """Linear layer with bias and an orthogonal kernel of the given gain."""
     return nnx.Linear(inputs, outputs, kernel_init=nnx.initializers.orthogonal(gain), dtype=dtype, rngs=rngs)
-
-
-@jax.custom_vjp
-def convolve(x_NHWC: jax.Array, kernel: jax.Array) -> jax.Array:
-    """Convolution of images with a kernel [3, 3, inputs, outputs], stride 1, SAME padding."""
-    return jax.lax.conv_general_dilated(x_NHWC, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
-
-
-def _convolve_forward(x_NHWC: jax.Array, kernel: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-    return convolve(x_NHWC, kernel), (x_NHWC, kernel)
-
-
-def _convolve_backward(saved: tuple[jax.Array, jax.Array], slope_NHWC: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Gradients by images and kernel.
-
-    Inside a loop, XLA on a CPU compiles the kernel's gradient, written as a convolution, to plain loops: 14 to 70
-    times slower than outside (jaxlib 0.10.1, measured). Nine matrix products are fast everywhere on a CPU; an
-    accelerator's convolution library does better with the convolution.
-    """
-    x_NHWC, kernel = saved
-    rotated = kernel[::-1, ::-1].swapaxes(2, 3)
-    by_kernel = jax.lax.platform_dependent(
-        x_NHWC, slope_NHWC, cpu=_kernel_gradient_by_products, default=_kernel_gradient_by_convolution
-    )
-    return convolve(slope_NHWC, rotated), by_kernel
-
-
-def _kernel_gradient_by_products(x_NHWC: jax.Array, slope_NHWC: jax.Array) -> jax.Array:
-    inputs = x_NHWC.shape[-1]
-    padded = jnp.pad(x_NHWC, ((0, 0), (1, 1), (1, 1), (0, 0)))
-    slope_MO = slope_NHWC.reshape(-1, slope_NHWC.shape[-1])
-
-    def product(offset: jax.Array) -> jax.Array:
-        corner = (0, offset // 3, offset % 3, 0)
-        return jax.lax.dynamic_slice(padded, corner, x_NHWC.shape).reshape(-1, inputs).T @ slope_MO
-
-    # A loop, because nine products side by side would hold nine copies of the images, of every layer, at once.
-    return jax.lax.map(product, jnp.arange(9)).reshape(3, 3, inputs, -1)
-
-
-def _kernel_gradient_by_convolution(x_NHWC: jax.Array, slope_NHWC: jax.Array) -> jax.Array:
-    return jax.lax.conv_general_dilated(
-        x_NHWC, slope_NHWC, (1, 1), ((1, 1), (1, 1)), dimension_numbers=("CHWN", "IHWO", "HWNC")
-    )
-
-
-convolve.defvjp(_convolve_forward, _convolve_backward)
 
 
 class Conv3x3(nnx.Module):
@@ -172,6 +126,8 @@ class ImpalaStack(nnx.Module):
 class ImpalaCNN(nnx.Module):
     """Impala CNN (Appendix A.1.1): one stack per entry of `config.cnn_channels`, activation, flatten.
 
+    With `config.embedding_size` layer norm, dense and ReLU follow.
+
     Norms follow `config.cnn_norm` (fidelity note 1): "instance" per frame and channel; "batch" per channel over
     the current batch; "layer" per frame over height, width and channels. `features` is the size of its output:
     8192 for 63x63 pixels and the paper's channels.
@@ -185,12 +141,26 @@ class ImpalaCNN(nnx.Module):
             height, width, channels = (height + 1) // 2, (width + 1) // 2, outputs
         self.features = height * width * channels
         self.activation = _ACTIVATIONS[config.activation]
+        self.projection = None if not config.embedding_size else Projection(self.features, config, dtype, rngs)
+        self.features = config.embedding_size or self.features
 
     def __call__(self, x_NHWC: jax.Array) -> jax.Array:
         """Images with values in [0, 1] to embeddings z [N, features]."""
         for stack in self.stacks:
             x_NHWC = stack(x_NHWC)
-        return self.activation(x_NHWC).reshape(x_NHWC.shape[0], self.features)
+        z_NF = self.activation(x_NHWC).reshape(x_NHWC.shape[0], -1)
+        return z_NF if self.projection is None else self.projection(z_NF)
+
+
+class Projection(nnx.Module):
+    """Layer norm, dense, ReLU: embeddings [N, inputs] to [N, config.embedding_size]."""
+
+    def __init__(self, inputs: int, config: PolicyConfig, dtype: Any, rngs: nnx.Rngs):
+        self.norm = Norm(inputs, (-1,), dtype)
+        self.dense = dense(inputs, config.embedding_size, RELU_GAIN, dtype, rngs)
+
+    def __call__(self, z_NF: jax.Array) -> jax.Array:
+        return jax.nn.relu(self.dense(self.norm(z_NF)))
 
 
 class SymbolMLP(nnx.Module):

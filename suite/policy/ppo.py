@@ -125,29 +125,35 @@ def generalized_advantages(
 class TargetStatistics:
     """Moving averages that standardize value targets (Algorithm 3, fidelity notes 8 and 9).
 
-    `mean`, `std` and `weight` (float32 scalars) all average from zero; dividing by `weight`, the average of ones,
+    `mean`, `spread` and `weight` (float32 scalars) all average from zero; dividing by `weight`, the average of ones,
     removes the bias towards zero. Before the first update the statistics are mean 0 and deviation 1.
+
+    Attributes:
+      spread: averages the standard deviation, or with `of_squares` the mean square (fidelity note 36).
+      min_std: the floor of the standard deviation.
     """
 
     mean: jax.Array
-    std: jax.Array
+    spread: jax.Array
     weight: jax.Array
     min_std: float = struct.field(pytree_node=False, default=0.1)
+    of_squares: bool = struct.field(pytree_node=False, default=False)
 
     @classmethod
-    def create(cls, min_std: float = 0.1) -> TargetStatistics:
-        """Statistics of nothing yet; `min_std` is the floor of the standard deviation."""
+    def create(cls, min_std: float = 0.1, of_squares: bool = False) -> TargetStatistics:
+        """Statistics of nothing yet."""
         zero = jnp.zeros((), jnp.float32)
-        return cls(mean=zero, std=zero, weight=zero, min_std=min_std)
+        return cls(mean=zero, spread=zero, weight=zero, min_std=min_std, of_squares=of_squares)
 
     def update(self, targets: jax.Array, mask: jax.Array | None, decay: float) -> TargetStatistics:
         """Takes in the mean and standard deviation of `targets` where `mask`; a mask of nothing changes nothing."""
         mean, std, count = _moments(targets, mask)
         keep = jnp.where(count > 0, decay, 1.0)
+        spread = jnp.square(std) + jnp.square(mean) if self.of_squares else std
         return dataclasses.replace(
             self,
             mean=keep * self.mean + (1.0 - keep) * mean,
-            std=keep * self.std + (1.0 - keep) * std,
+            spread=keep * self.spread + (1.0 - keep) * spread,
             weight=keep * self.weight + (1.0 - keep),
         )
 
@@ -155,7 +161,9 @@ class TargetStatistics:
         """Mean and standard deviation in use."""
         seen = self.weight > 0
         weight = jnp.where(seen, self.weight, 1.0)
-        return self.mean / weight, jnp.where(seen, jnp.maximum(self.std / weight, self.min_std), 1.0)
+        mean, spread = self.mean / weight, self.spread / weight
+        std = jnp.sqrt(jnp.maximum(spread - jnp.square(mean), 0.0)) if self.of_squares else spread
+        return mean, jnp.where(seen, jnp.maximum(std, self.min_std), 1.0)
 
     def standardize(self, targets: jax.Array) -> jax.Array:
         """From units of reward to those that the value network predicts."""
@@ -179,7 +187,11 @@ class Learner:
     @classmethod
     def create(cls, ppo: PPOConfig, optimizer: optax.GradientTransformation, params: nnx.State) -> Learner:
         """A fresh learner of `params`, the state of `nnx.split(policy)`."""
-        return cls(params, optimizer.init(params), TargetStatistics.create(ppo.target_min_std))
+        return cls(
+            params,
+            optimizer.init(params),
+            TargetStatistics.create(ppo.target_min_std, ppo.target_spread == "mean_square"),
+        )
 
     @property
     def acting(self) -> Learner:

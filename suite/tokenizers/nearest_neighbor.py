@@ -41,7 +41,7 @@ class NearestNeighborTokenizer:
     Attributes:
       codebook_size: K; a full codebook stops growing.
       threshold: squared Euclidean distance, of patches scaled to [0, 1], above which a patch becomes a code.
-      patch: (height, width) of a patch; must fill the frame exactly, else ValueError.
+      patch: (height, width) of a patch.
       observation: the frames, of kind "pixels" or "grid".
       metrics: names of what `update` returns.
     """
@@ -70,6 +70,11 @@ class NearestNeighborTokenizer:
     def num_codes(self) -> int:
         """K."""
         return self.codebook_size
+
+    @property
+    def token_size(self) -> int:
+        """0: tokens are codes."""
+        return 0
 
     def init(self, key: jax.Array) -> NearestNeighborState:
         """An empty codebook; `key` is not used."""

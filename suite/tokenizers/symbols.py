@@ -30,6 +30,11 @@ class SymbolTokenizer:
         return self.observation.high + 1
 
     @property
+    def token_size(self) -> int:
+        """0: tokens are codes."""
+        return 0
+
+    @property
     def grid(self) -> tuple[int, int]:
         """Symbols have no rows: (1, L)."""
         return (1, self.tokens_per_frame)

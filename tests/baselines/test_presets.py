@@ -65,8 +65,10 @@ NOTES = {
     "policy.cnn_norm": "instance",  # 1
     "policy.activation": "relu",
     "policy.dense_blocks": 2,
+    "policy.embedding_size": 0,
     "policy.shared_trunk": False,
     "ppo.target_min_std": 0.1,  # 8
+    "ppo.target_spread": "deviation",  # 8
     "ppo.adam_eps": 1e-5,  # 9
     "ppo.learn_from_real": True,
 }
@@ -75,6 +77,10 @@ MODEL_NOTES = {
     "tokenizer.codebook_size": 4096,
     "tokenizer.threshold": 0.75,  # 13
     "tokenizer.patch": None,  # the task's natural one: 7x7
+    "tokenizer.embed_dim": 128,  # 15; these four belong to the VQ-VAEs
+    "tokenizer.channels": (64, 64, 128, 128, 256),
+    "tokenizer.loss_weights": (1.0, 0.0, 1.0, 0.25),
+    "tokenizer.learning_rate": 0.001,
     "world_model.enabled": True,
     "world_model.positions": "flat",  # 20
     "world_model.mask_after_done": False,  # 21
@@ -117,13 +123,84 @@ def test_the_tables_leave_out_no_hyperparameter():
     assert settings("m5").keys() - covered == elsewhere
 
 
-def test_m5_slow_differs_in_world_model_updates_only():
-    """4000 instead of 500: fidelity note 27."""
-    slow, fast = settings("m5_slow"), settings("m5")
-    assert {name: value for name, value in slow.items() if value != fast[name]} == {
-        "agent": "m5_slow",
-        "world_model.updates": 4000,
-    }
+# Section 4.1 and Table 2: what each model-based agent changes of M5.
+NO_BTF = {"world_model.block_teacher_forcing": False}
+NO_DYNA = {"ppo.learn_from_real": False}
+PATCH_VQ = {
+    "tokenizer.kind": "patch_vq_vae",
+    "tokenizer.codebook_size": 512,
+    "tokenizer.updates": 500,
+    "tokenizer.loss_weights": (0.1, 1.0, 1.0, 0.02),
+}
+FRAME_VQ = {"tokenizer.kind": "vq_vae", "tokenizer.codebook_size": 512, "tokenizer.updates": 500}  # 15
+FROM_M5 = {
+    "m1": FRAME_VQ | NO_BTF | NO_DYNA,
+    "m2": FRAME_VQ | NO_BTF,
+    "m3": PATCH_VQ | NO_BTF,
+    "m4": NO_BTF,
+    "m5_slow": {"world_model.updates": 4000},  # 27
+    "m5_patch5": {"tokenizer.patch": (5, 5)},
+    "m5_patch9": {"tokenizer.patch": (9, 9)},
+    "m5_continuous": {"tokenizer.kind": "continuous"},
+    "m5_no_dyna": NO_DYNA,
+    "m5_no_nnt": PATCH_VQ,
+    "m5_no_nnt_no_patches": FRAME_VQ,
+    "m5_no_btf": NO_BTF,
+    "m5_tbp0": {"imagination.start_step": 0},
+    "m5_annealed": {  # 38
+        "imagination.schedule": "linear",
+        "imagination.start_step": 0,
+        "imagination.updates": 300,
+    },
+}
+PRIOR_SIZES = {"policy.embedding_size": 256, "policy.hidden_size": 1024}
+FROM_MFRL = {
+    "mfrl_no_rnn": {"policy.rnn_size": 0},
+    "mfrl_small": PRIOR_SIZES | {"policy.dense_blocks": 0},
+    "mfrl_prior": PRIOR_SIZES  # 36
+    | {
+        "policy.kind": "moon",
+        "policy.rnn_size": 0,
+        "environment.num_envs": 8,
+        "environment.rollout_length": 512,
+        "environment.burn_in": 0,
+        "ppo.discount": 0.95,
+        "ppo.gae_lambda": 0.65,
+        "ppo.value_coefficient": 0.5,
+        "ppo.target_decay": 0.99,
+        "ppo.target_spread": "mean_square",
+        "ppo.learning_rate": 3e-4,
+        "ppo.anneal_learning_rate": False,
+        "ppo.adam_eps": 1e-8,
+        "ppo.epochs": 3,
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("base", "agent", "changes"),
+    [("m5", *item) for item in FROM_M5.items()] + [("mfrl", *item) for item in FROM_MFRL.items()],
+)
+def test_an_agent_differs_in_what_the_paper_says_and_in_nothing_else(base, agent, changes):
+    found, reference = settings(agent), settings(base)
+    different = {name: value for name, value in found.items() if value != reference[name]}
+    assert different == {"agent": agent, **changes}
+
+
+def test_every_agent_is_held_against_the_paper():
+    assert registry.agents().keys() == FROM_M5.keys() | FROM_MFRL.keys() | {"m5", "mfrl", "random"}
+
+
+@pytest.mark.parametrize("agent", ["m1", "m5_no_dyna"])
+def test_without_dyna_nothing_is_learned_before_imagination(agent):
+    """Fidelity note 26."""
+    config = registry.resolve("craftax_classic", agent, "paper")
+    assert not config.ppo.learn_from_real and config.imagined_updates(199_999) == 0
+
+
+def test_annealed_updates_grow_to_300():
+    config = registry.resolve("craftax_classic", "m5_annealed", "paper")
+    assert [config.imagined_updates(step) for step in (0, 500_000, 1_000_000)] == [0, 150, 300]
 
 
 def test_random_learns_nothing():
@@ -141,8 +218,15 @@ def test_every_agent_has_every_preset(agent, preset):
 
 @pytest.mark.parametrize("preset", ["small", "smoke"])
 def test_a_preset_keeps_what_defines_an_agent(preset):
+    m5 = settings("m5", preset)
     assert not settings("mfrl", preset)["world_model.enabled"]
-    assert settings("m5_slow", preset)["world_model.updates"] == 8 * settings("m5", preset)["world_model.updates"]
+    assert settings("m5_slow", preset)["world_model.updates"] == 8 * m5["world_model.updates"]
+    for agent in ("m1", "m3", "m5_no_nnt"):
+        found = settings(agent, preset)
+        assert found["tokenizer.updates"] == m5["world_model.updates"]
+        assert found["tokenizer.codebook_size"] == min(512, m5["tokenizer.codebook_size"])
+    assert settings("m5_annealed", preset)["imagination.updates"] == 2 * m5["imagination.updates"]
+    assert settings("mfrl_prior", preset)["policy.hidden_size"] == m5["policy.hidden_size"] // 2
 
 
 @pytest.mark.parametrize("preset", ["small", "smoke"])

@@ -9,7 +9,7 @@ import pytest
 
 from suite.interface.environment import ObservationSpec
 from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
-from suite.tokenizers.patches import join_patches, split_patches
+from suite.tokenizers.patches import join_patches, patch_grid, split_patches
 
 FRAME = ObservationSpec(shape=(4, 6, 1), high=255, kind="pixels", patch=(2, 2))
 
@@ -161,7 +161,26 @@ def test_patches_are_split_row_by_row_and_joined_again():
     np.testing.assert_array_equal(join_patches(patches, (4, 6, 1), (2, 2)), frame)
 
 
-def test_a_patch_that_does_not_fill_the_frame_is_refused():
-    tokenizer = NearestNeighborTokenizer(4, 0.75, (3, 2), FRAME)
-    with pytest.raises(ValueError, match="patches of 3x2 do not fill a frame of 4x6"):
+def test_a_frame_is_made_larger_until_patches_fill_it():
+    """Fidelity note 37: 63 pixels and patches of 5 make 13x13 patches; edge pixels are repeated below and on the right."""
+    assert patch_grid((63, 63, 3), (5, 5)) == (13, 13)
+    frame = jnp.arange(24, dtype=jnp.uint8).reshape(4, 6, 1)
+    patches = split_patches(frame, (3, 4))
+    assert patches.shape == (4, 12)
+    np.testing.assert_array_equal(patches[3].reshape(3, 4), [[22, 23, 23, 23]] * 3)
+    np.testing.assert_array_equal(join_patches(patches, (4, 6, 1), (3, 4)), frame)
+
+
+@pytest.mark.parametrize("patch", [(2, 2), (3, 4)])
+def test_patch_factorization_is_exact_for_stored_patches(patch):
+    """Split, encode, decode, join: the same pixels, where every patch became a code."""
+    tokenizer = NearestNeighborTokenizer(64, 0.0, patch, FRAME)
+    frames = random_frames(3, 5)
+    state, _ = tokenizer.update(tokenizer.init(jax.random.key(0)), frames)
+    np.testing.assert_array_equal(tokenizer.decode(state, tokenizer.encode(state, frames)), frames)
+
+
+def test_a_patch_larger_than_the_frame_is_refused():
+    tokenizer = NearestNeighborTokenizer(4, 0.75, (5, 2), FRAME)
+    with pytest.raises(ValueError, match="patches of 5x2 are larger than a frame of 4x6"):
         assert tokenizer.grid
