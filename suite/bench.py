@@ -14,7 +14,7 @@ from suite.agent.dyna import Agent
 from suite.compilation import enable_compilation_cache
 from suite.config import Config
 from suite.flops import count_flops
-from suite.races import Table, cache_race, reset_race, seconds_of, start_up_race
+from suite.races import Table, cache_race, reset_race, sampler_race, seconds_of, start_up_race
 from suite.record import peak_memory
 from suite.reporting import Reporter
 
@@ -53,6 +53,8 @@ def bench(config: Config, reporter: Reporter, start_up: bool = True) -> dict[str
     if config.world_model.enabled:
         reporter.message("racing the key-value cache")
         report["one imagined step"] = cache_race(agent)
+        if race := sampler_race(agent):
+            report["one imagined frame"] = race
     if start_up:
         reporter.message("starting the same command twice")
         report["seconds to the first training step"] = start_up_race(config)

@@ -263,7 +263,7 @@ def _problems(config: Config) -> Iterator[str]:
     if config.policy.kind == "moon" and (config.policy.rnn_size or not config.policy.embedding_size):
         yield "policy.kind=moon has no memory and an embedding: policy.rnn_size=0, and policy.embedding_size above 0"
     if config.tokenizer.kind == "continuous" and not model.block_teacher_forcing:
-        yield "tokenizer.kind=continuous needs world_model.block_teacher_forcing=true: one by one only codes are sampled"
+        yield "tokenizer.kind=continuous needs world_model.block_teacher_forcing=true: its tokens are no codes"
     if config.protocol.steps < config.steps_per_iteration:
         yield (
             f"protocol.steps={config.protocol.steps} is less than one iteration of "

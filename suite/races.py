@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import subprocess
@@ -23,7 +24,9 @@ from suite.config import Config
 from suite.interface.batching import Batched
 from suite.interface.environment import BatchedEnvironment, Environment
 from suite.interface.host import HostEnvironment
+from suite.interface.tokens import TokenSpec
 from suite.interface.turns import choose_event
+from suite.world_model.imagination import next_frame
 from suite.world_model.transformer import WorldModel
 
 Table = list[dict[str, Any]]
@@ -117,7 +120,7 @@ def cache_race(agent: Agent) -> Table:
     batch, length = config.imagination.num_envs, RACE_FRAMES
     model: WorldModel = nnx.merge(agent.world_model_graph, agent.init(jax.random.key(0)).world_model.params)
     graph, params = nnx.split(model)
-    frames = jax.random.randint(jax.random.key(1), (batch, length, tokens.tokens_per_frame), 0, tokens.num_codes)
+    frames = _random_tokens(tokens, (batch, length))
     actions = jax.random.randint(jax.random.key(2), (batch, length), 0, tokens.num_actions)
     cache = model.init_cache(batch, length)
     cache = dataclasses.replace(cache, index=jnp.int32((length - 1) * model.block))
@@ -138,6 +141,42 @@ def cache_race(agent: Agent) -> Table:
         {"method": "key-value cache", "ms": 1e3 * fast, "times faster": slow / fast},
         {"method": f"recomputing {length} frames", "ms": 1e3 * slow, "times faster": 1.0},
     ]
+
+
+def sampler_race(agent: Agent) -> Table:
+    """The frame after 20 frames, imagined as a block and token by token, both with the key-value cache (Section 3.6).
+
+    Models of the same size, fresh. No race where tokens are vectors: those cannot be imagined one by one.
+    """
+    tokens, batch = agent.tokens, agent.config.imagination.num_envs
+    if tokens.token_size:
+        return []
+    frame_BL = _random_tokens(tokens, (batch,))
+    action_B = jax.random.randint(jax.random.key(2), (batch,), 0, tokens.num_actions)
+    valid_K = jnp.ones(tokens.num_codes, bool)
+    times: dict[str, float] = {}
+    for name, blocks in (("as a block", True), ("token by token", False)):
+        config = dataclasses.replace(agent.config.world_model, block_teacher_forcing=blocks)
+        model = WorldModel(config, tokens, agent.grid, nnx.Rngs(0))
+        graph, params = nnx.split(model)
+        cache = model.init_cache(batch, RACE_FRAMES)
+        cache = dataclasses.replace(cache, index=jnp.int32((RACE_FRAMES - 1) * model.block))
+
+        @jax.jit
+        def imagine(params, cache, graph=graph):
+            return next_frame(jax.random.key(3), nnx.merge(graph, params), cache, frame_BL, action_B, valid_K)[2]
+
+        jax.block_until_ready(imagine(params, cache))
+        times[name] = seconds_of(functools.partial(imagine, params, cache))
+    slowest = max(times.values())
+    return [{"tokens": name, "ms": 1e3 * time, "times faster": slowest / time} for name, time in times.items()]
+
+
+def _random_tokens(tokens: TokenSpec, lead: tuple[int, ...]) -> jax.Array:
+    shape = (*lead, tokens.tokens_per_frame)
+    if tokens.token_size:
+        return jax.random.uniform(jax.random.key(1), (*shape, tokens.token_size))
+    return jax.random.randint(jax.random.key(1), shape, 0, tokens.num_codes)
 
 
 def start_up_race(config: Config) -> Table:

@@ -29,6 +29,8 @@ def test_every_phase_is_measured_and_projected(monkeypatch):
         "no reset",
     ]
     assert report["one imagined step"][0]["times faster"] > 0
+    assert [row["tokens"] for row in report["one imagined frame"]] == ["as a block", "token by token"]
+    assert all(row["ms"] > 0 for row in report["one imagined frame"])
 
 
 def test_hosted_engines_race_without_the_contestant_that_plays_past_the_end(monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -58,6 +60,24 @@ class Corridor:
         observation = jnp.repeat(jnp.repeat(frame, 2, 0), 2, 1)[..., None]
         statistics = {"achievements": (reward > 0)[None], "achievement_return": reward, "health_return": 0 * reward}
         return TimeStep(observation, reward, terminated, truncated, first, observation, statistics)
+
+
+WIDE_CORRIDOR_SPEC = dataclasses.replace(
+    CORRIDOR_SPEC,
+    id="wide_corridor",
+    observation=dataclasses.replace(CORRIDOR_SPEC.observation, shape=(10, 10, 1), patch=(5, 5)),
+)
+
+
+class WideCorridor(Corridor):
+    """The same from frames of 10x10, so that patches of every size that the agents have fit."""
+
+    spec = WIDE_CORRIDOR_SPEC
+
+    def _show(self, *what) -> TimeStep:
+        small = super()._show(*what)
+        frame = jnp.kron(small.observation[::2, ::2, 0], jnp.ones((5, 5), jnp.uint8))[..., None]
+        return dataclasses.replace(small, observation=frame, final_observation=frame)
 
 
 PENNIES_SPEC = EnvironmentSpec(
@@ -132,6 +152,23 @@ def make_corridor(progress=None) -> Corridor:
     return Corridor()
 
 
+def make_wide_corridor(progress=None) -> WideCorridor:
+    """As a task's factory."""
+    return WideCorridor()
+
+
+def two_iterations(config: Config) -> Config:
+    """As `corridor_smoke`, with networks for VQ-VAEs; imagination from the second iteration."""
+    changes = {
+        "protocol.steps": 64,
+        "imagination.start_step": 64,
+        "imagination.updates": 1,
+        "tokenizer.embed_dim": 4,
+        "tokenizer.channels": (2, 2, 2, 2, 2),
+    }
+    return apply_changes(corridor_smoke(config), changes)
+
+
 def corridor_smoke(config: Config) -> Config:
     """Six iterations of 32 steps; imagination from the third."""
     changes = {
@@ -174,6 +211,16 @@ CORRIDOR = TaskEntry(
     make=Lazy("tests.tiny:make_corridor"),
     scores=Lazy("leaderboards.scoring:craftax"),
     presets={"smoke": Lazy("tests.tiny:corridor_smoke")},
+)
+
+WIDE_CORRIDOR = TaskEntry(
+    id="wide_corridor",
+    family="corridor",
+    summary="for tests",
+    spec=Lazy("tests.tiny:WIDE_CORRIDOR_SPEC"),
+    make=Lazy("tests.tiny:make_wide_corridor"),
+    scores=Lazy("leaderboards.scoring:craftax"),
+    presets={"smoke": Lazy("tests.tiny:two_iterations")},
 )
 
 PENNIES = TaskEntry(

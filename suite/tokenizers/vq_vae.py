@@ -1,7 +1,7 @@
 """Tokenizers that are learned: VQ-VAEs of whole frames (M1, M2) and of patches (M3); Appendix A.2.1, fidelity note 15.
 
-Shapes: N frames, L latents per frame of D numbers, K codes. Codes and latents have unit norm, so the nearest code is the
-one with the largest inner product.
+Shapes: N frames, L latents per frame of D numbers, K codes. Codes and latents have unit norm, so the nearest code is
+the one with the largest inner product.
 """
 
 from __future__ import annotations

@@ -30,10 +30,10 @@ def causal_attention(
 ) -> jax.Array:
     """Attention of every token to its whole own unit and all earlier ones.
 
-    With the block as the unit that is the block-causal mask (Section 3.6, fidelity note 18), with a token the usual one.
+    The block as the unit gives the block-causal mask (Section 3.6, fidelity note 18), a single token the usual one.
 
     Another kernel replaces this one function. Here the queries are cut into `groups` runs of whole blocks, each of
-    which sees a static prefix of the keys: with a run for each block nothing that the block-causal mask forbids is computed.
+    which sees a static prefix of the keys: with a run for each block nothing that the first mask forbids is computed.
     The backward pass recomputes the weights: S * S of them are not kept.
 
     Args:

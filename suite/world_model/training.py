@@ -1,4 +1,4 @@
-"""One gradient step of the world model: teacher forcing, block by block or not, and its losses (Section 3.6, Appendix A.2.2)."""
+"""One gradient step of the world model: teacher forcing, block by block or not (Section 3.6, Appendix A.2.2)."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ def _token_losses(model: WorldModel, hidden_BTSD: jax.Array, target_BTL: jax.Arr
         distance = jnp.square(predicted - target).sum(-1)
         return distance, (distance <= SAME_PATCH).astype(jnp.float32)
 
-    batch, tokens = target_BTL.shape[0], hidden_BTSD.shape[:2] + (model.block - 1,)
+    batch, tokens = target_BTL.shape[0], (*hidden_BTSD.shape[:2], model.block - 1)
     logits = math.prod(tokens[1:]) * model.observation_head.bias.shape[0]
     chunk = max(
         size for size in range(1, batch + 1) if batch % size == 0 and size * logits <= max(CHUNK_LOGITS, logits)

@@ -11,7 +11,9 @@ import pytest
 from flax import nnx
 
 from suite.config import PolicyConfig
-from suite.policy import networks
+from suite.interface.environment import ObservationSpec
+from suite.policy import moon, networks
+from suite.policy.actor_critic import ActorCritic
 
 TINY = PolicyConfig(cnn_channels=(4, 6), hidden_size=8, rnn_size=5)
 
@@ -184,3 +186,65 @@ def test_bfloat16_computes_in_bfloat16_and_keeps_float32_parameters_and_memory()
     gru = networks.GRU(5, jnp.bfloat16, nnx.Rngs(0))
     output_TBF, hidden_BF = gru(random(2, 3, 5).astype(jnp.bfloat16), jnp.zeros((2, 3), bool), jnp.zeros((3, 5)))
     assert output_TBF.dtype == hidden_BF.dtype == jnp.float32
+
+
+def count(module) -> int:
+    return sum(x.size for x in jax.tree.leaves(nnx.state(module, nnx.Param)))
+
+
+def test_an_embedding_is_layer_norm_dense_and_relu_of_the_cnns_output():
+    plain, mapped = cnn(), cnn(embedding_size=7)
+    mapped.stacks = plain.stacks
+    x_NHWC = jax.random.uniform(jax.random.key(1), (2, 9, 10, 3))
+    z_NF = np.asarray(call(plain, x_NHWC), np.float64)
+    normed = (z_NF - z_NF.mean(-1, keepdims=True)) / np.sqrt(z_NF.var(-1, keepdims=True) + 1e-5)
+    kernel = np.asarray(mapped.projection.dense.kernel[...])
+    assert mapped.features == 7 and kernel.shape == (plain.features, 7)
+    np.testing.assert_allclose(call(mapped, x_NHWC), np.maximum(normed @ kernel, 0), atol=1e-4)
+
+
+def test_moons_network_by_flax_layers():
+    """Fidelity note 36: layers of [norm, convolution, ReLU], the first without norm; max-pooling, norm, blocks."""
+    config = PolicyConfig(
+        kind="moon",
+        cnn_channels=(4,),
+        blocks_per_stack=1,
+        convs_per_block=2,
+        hidden_size=8,
+        rnn_size=0,
+        embedding_size=6,
+    )
+    network = moon.MoonCNN((6, 6, 3), config, jnp.float32, nnx.Rngs(0))
+    stack = network.stacks[0]
+
+    def norm(x):
+        mean, variance = x.mean((1, 2, 3), keepdims=True), x.var((1, 2, 3), keepdims=True)
+        return (x - mean) / jnp.sqrt(variance + 1e-5)
+
+    def conv(layer, x):
+        kernel = layer.conv.kernel[...]
+        return jax.nn.relu(
+            jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+        )
+
+    x = jax.random.uniform(jax.random.key(0), (2, 6, 6, 3))
+    y = norm(nnx.max_pool(conv(stack.conv, x), (3, 3), (2, 2), "SAME"))
+    block = stack.blocks[0]
+    y = y + conv(block[1], norm(conv(block[0], norm(y))))
+    flat = np.asarray(y.reshape(2, -1))
+    flat = (flat - flat.mean(-1, keepdims=True)) / np.sqrt(flat.var(-1, keepdims=True) + 1e-5)
+    expected = np.maximum(flat @ np.asarray(network.projection.dense.kernel[...]), 0)
+    np.testing.assert_allclose(network(x), expected, atol=1e-4)
+
+
+def test_moons_actor_and_critic_share_all_but_their_last_layer():
+    config = PolicyConfig(
+        kind="moon", cnn_channels=(4,), blocks_per_stack=1, hidden_size=8, rnn_size=0, embedding_size=6
+    )
+    policy = ActorCritic(config, ObservationSpec((6, 6, 3), 255, "pixels", (3, 3)), 5, nnx.Rngs(0))
+    assert len(policy.trunks) == 1 and policy.memory is None
+    assert count(policy.trunks[0]) == 2 * 6 + 6 * 8 + 8
+    output, hidden_BH = policy(jnp.zeros((3, 2, 6, 6, 3), jnp.uint8), jnp.zeros((3, 2), bool), policy.initial_hidden(2))
+    assert output.logits_TBA.shape == (3, 2, 5) and hidden_BH.shape == (2, 0)
+    gain = np.linalg.norm(policy.value_head.kernel[...])
+    np.testing.assert_allclose(gain, 0.1, rtol=1e-5)

@@ -143,6 +143,21 @@ def test_one_update_of_target_statistics_is_exactly_what_was_seen():
     np.testing.assert_allclose(statistics.corrected(), (2.0, 1.0), rtol=1e-5)
 
 
+def test_the_spread_of_targets_may_be_averaged_as_mean_squares():
+    """Fidelity note 36: the variance is the averaged mean square less the square of the averaged mean."""
+    statistics, mean, square = ppo.TargetStatistics.create(of_squares=True), 0.0, 0.0
+    assert [float(x) for x in statistics.corrected()] == [0.0, 1.0]
+    for n, batch in enumerate([[1.0, 3.0], [5.0, 5.0], [0.0, 2.0]], start=1):
+        statistics = statistics.update(jnp.array(batch), None, 0.99)
+        mean = 0.99 * mean + 0.01 * np.mean(batch)
+        square = 0.99 * square + 0.01 * np.mean(np.square(batch))
+        weight = 1 - 0.99**n
+        expected = mean / weight, np.sqrt(square / weight - (mean / weight) ** 2)
+        np.testing.assert_allclose(statistics.corrected(), expected, rtol=1e-4)
+    settled = ppo.TargetStatistics.create(of_squares=True).update(jnp.full(4, 7.0), None, 0.99)
+    np.testing.assert_allclose(settled.corrected(), (7.0, 0.1), rtol=1e-4)
+
+
 def test_deviation_of_targets_has_a_floor():
     statistics = ppo.TargetStatistics.create(min_std=0.25).update(jnp.full(4, 7.0), None, 0.95)
     np.testing.assert_allclose(statistics.corrected(), (7.0, 0.25), rtol=1e-5)

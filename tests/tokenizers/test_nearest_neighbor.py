@@ -162,7 +162,7 @@ def test_patches_are_split_row_by_row_and_joined_again():
 
 
 def test_a_frame_is_made_larger_until_patches_fill_it():
-    """Fidelity note 37: 63 pixels and patches of 5 make 13x13 patches; edge pixels are repeated below and on the right."""
+    """Fidelity note 37: 63 pixels make 13x13 patches of 5; edge pixels are repeated below and on the right."""
     assert patch_grid((63, 63, 3), (5, 5)) == (13, 13)
     frame = jnp.arange(24, dtype=jnp.uint8).reshape(4, 6, 1)
     patches = split_patches(frame, (3, 4))

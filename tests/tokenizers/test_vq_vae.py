@@ -51,7 +51,7 @@ def test_the_contract_and_learning(kind, grid):
 
     tokens = tokenizer.encode(learned, frames.reshape(4, 16, *FRAME.shape))
     assert tokens.shape == (4, 16, tokenizer.tokens_per_frame) and tokens.dtype == jnp.int32
-    assert 0 <= int(tokens.min()) and int(tokens.max()) < 16
+    assert int(tokens.min()) >= 0 and int(tokens.max()) < 16
     decoded = tokenizer.decode(learned, tokens)
     assert decoded.shape == (4, 16, *FRAME.shape) and decoded.dtype == jnp.uint8
     single = tokenizer.decode(learned, tokenizer.encode(learned, frames[3]))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.world_model.attention import causal_attention, token_positions, cached_attention, rope
+from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
 
 
 def inputs(steps: int = 5, block: int = 7, heads: int = 2, width: int = 4) -> tuple[jax.Array, ...]:

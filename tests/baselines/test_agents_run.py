@@ -1,0 +1,37 @@
+"""Every agent, two whole iterations of Algorithm 1, imagination in the second, on a tiny task."""
+
+from __future__ import annotations
+
+import jax
+import pandas as pd
+import pytest
+
+from suite import registry, run
+from suite.reporting import QuietReporter
+from tests.tiny import WIDE_CORRIDOR
+
+SAME_PROGRAMS = {"m5_slow", "m5_tbp0", "m5_annealed", "m5_no_btf"}  # as m5 or m4 but for numbers; tested as settings
+
+
+@pytest.fixture(autouse=True, scope="module")
+def hasty_compilation():
+    """Sixteen agents are compiled here to run for a moment each."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.mark.parametrize("agent", sorted(registry.agents().keys() - SAME_PROGRAMS))
+def test_two_iterations(agent, tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
+    config = registry.resolve("wide_corridor", agent, "smoke")
+    result = run.run(config, tmp_path, QuietReporter())
+    assert (result.status, result.steps) == ("finished", 64)
+    metrics = pd.read_csv(result.folder / "metrics.csv")
+    assert len(metrics) == 2
+    last = metrics.iloc[-1].dropna().index
+    phases = {name.partition("/")[0] for name in last if "/" in name}
+    expected = {"learn"} if config.ppo.learn_from_real else set()
+    if config.world_model.enabled:
+        expected |= {"world_model", "imagine"} | ({"tokenizer"} if config.tokenizer.kind != "continuous" else set())
+    assert phases == expected
