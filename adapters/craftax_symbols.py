@@ -9,7 +9,7 @@ R = 145 symbols with values in 0..16 (fidelity note 33), chosen so that each can
 - 16 counts, 0..9: health, food, drink and energy, then the items, in the order of the inventory's slots.
 - where the player faces: 1 left, 2 right, 3 up, 4 down; 0 while asleep, when he lies.
 - 1 while asleep.
-- daylight, from 0 to 4, rounded.
+- 0 at night, 1 at dusk and dawn, 2 by day.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from adapters.craftax_renderer import CENTER, COLUMNS, ITEMS, MARGIN, NEEDS, OUT
 VALUES = 17
 BLANK = 0  # a tile that the night hides, and a tile without a creature
 PLAYER, ZOMBIE, COW, SKELETON, ARROW = range(1, 6)  # ascending in the order of drawing
-DAYLIGHTS = 4
+DAYLIGHTS = 2
 # The share of noise in a tile's pixels from which its content cannot be told any more.
-HIDING_NOISE = 0.8
+HIDING_NOISE = 0.6
 
 
 def classic_symbols(state: Any, hiding_noise: float = HIDING_NOISE) -> jax.Array:

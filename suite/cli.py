@@ -82,7 +82,7 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
         "list": "tasks, agents or presets, one line each",
         "describe": "the whole configuration, layers and parameter counts, without running anything",
         "evaluate": "play whole episodes with a run's newest checkpoint",
-        "inspect": "how well the world models of two-player games keep the rules",
+        "inspect": "how good world models are: rollouts beside reality; of games, whether they keep the rules",
         "bench": "time, share and speed of each phase",
     }
     commands = {
@@ -102,7 +102,9 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
     commands["evaluate"].add_argument("--policy", metavar="module:Class", help="somebody else's policy")
     commands["evaluate"].add_argument("--episodes", type=int, metavar="N", help="at least so many")
     commands["inspect"].add_argument("folders", nargs="+", type=Path, metavar="RUN_DIR", help="a run's folder")
-    commands["inspect"].add_argument("--games", type=int, default=1000, metavar="N", help="imagined (default 1000)")
+    inspect = commands["inspect"]
+    inspect.add_argument("--games", type=int, default=1000, metavar="N", help="games to imagine (default 1000)")
+    inspect.add_argument("--out", type=Path, metavar="DIR", help="where to (default: inspect, where the runs are)")
     for name in ("run", "evaluate", "inspect", "bench"):
         commands[name].add_argument("--quiet", action="store_true", help="no progress")
     for command in commands.values():
@@ -267,9 +269,11 @@ def _inspect(args: argparse.Namespace) -> int:
 
     if args.games < 1:
         raise UserError(f"--games={args.games}: must be at least 1")
-    for folder in args.folders:
-        RunRecord.open(folder, lock=False)
+    records = [RunRecord.open(folder, lock=False) for folder in args.folders]
+    return _inspect_games(args) if all(record.spec.two_player for record in records) else _inspect_rollouts(args)
 
+
+def _inspect_games(args: argparse.Namespace) -> int:
     from suite.diagnostics.rules import rules_of_run
 
     reporter = _reporter(args.quiet)
@@ -280,6 +284,25 @@ def _inspect(args: argparse.Namespace) -> int:
         columns = [[_value(kept[row]) for row in kept] for kept in plays.values()]
         rows = [row.replace("_percent", " %").replace("_", " ") for row in next(iter(plays.values()))]
         _print_table([["played by", *plays], *zip(rows, *columns, strict=True)])
+    if args.json:
+        _print_json(found)
+    return 0
+
+
+def _inspect_rollouts(args: argparse.Namespace) -> int:
+    from suite.diagnostics.inspection import inspect
+
+    reporter = _reporter(args.quiet)
+    found = inspect(args.folders, args.out, reporter)
+    reporter.stop()
+    runs = found["runs"]
+    names = list(dict.fromkeys(name for row in runs.values() for name in row))
+    rows = [
+        [name.replace("_percent", " %").replace("_", " "), *(_value(row.get(name, "")) for row in runs.values())]
+        for name in names
+    ]
+    _print_table([["mean over rollout steps", *runs], *rows])
+    print(f"tables, curves and filmstrips in {found['folder']}")
     if args.json:
         _print_json(found)
     return 0

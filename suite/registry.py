@@ -59,8 +59,8 @@ class TaskEntry:
       presets: by name, functions `Config -> Config`; they see the agent's id in `config.agent`.
       own_auto_reset: the batched environment, made from a number of environments, that resets as the package itself
         does; for `suite bench` only. None: it has no auto-reset.
-      symbols: a function from an environment's state to what its frame shows, int32 [R], for `suite inspect`; None: what
-        it shows is not known.
+      symbols: a function from an environment's state to what its frame shows, int32 [R], for `suite inspect`; None:
+        what it shows is not known.
       symbol_values: how many values a symbol has.
       cost: what a run takes, in words.
     """

@@ -121,8 +121,8 @@ def test_bad_commands(suite, never, words, message):
     assert os.listdir() == []
 
 
-def test_inspecting_a_run_without_a_game(suite, folder):
-    refused(suite("inspect", str(folder)), f"{folder} has no world model of a two-player game")
+def test_inspecting_a_run_without_a_world_model(suite, folder):
+    refused(suite("inspect", str(folder)), f"{folder} has no world model: mfrl learns from real play only")
 
 
 @pytest.fixture

@@ -60,12 +60,14 @@ def test_losses_by_hand():
     model = small_model(std=0.2, block_teacher_forcing=False)
     _, metrics = losses(model, SEQUENCES, config, SPEC)
     frames = np.asarray(SEQUENCES.tokens_BTL)
-    hidden_BTSD = model(SEQUENCES.tokens_BTL[:, :-1], SEQUENCES.action_BT)
+    hidden_BTSD = model(
+        SEQUENCES.tokens_BTL, jnp.concatenate([SEQUENCES.action_BT, SEQUENCES.action_BT[:, :1]], axis=1)
+    )
     total, correct, changed, count, changes = 0.0, 0, 0, 0, 0
     for b in range(4):
-        for t in range(5):
+        for t in range(6):
             for place in range(7):
-                if place == 5:  # the frame's last token predicts nothing
+                if place == 5 or (t, place) == (5, 6):  # a frame's last token predicts nothing, and the end neither
                     continue
                 when, which = (t + 1, 0) if place == 6 else (t, place + 1)
                 target = frames[b, when, which]
@@ -78,7 +80,9 @@ def test_losses_by_hand():
     np.testing.assert_allclose(metrics["observation_loss"], total / count, rtol=1e-5)
     np.testing.assert_allclose(metrics["token_accuracy"], correct / count, rtol=1e-5)
     np.testing.assert_allclose(metrics["changed_token_accuracy"], changed / changes, rtol=1e-5)
-    assert count == 4 * 5 * 6
+    assert count == 4 * (5 * 6 + 5)
+    rewards = nats(model.reward_logits(hidden_BTSD[:, :5]), SPEC.reward_to_class(SEQUENCES.reward_BT))
+    np.testing.assert_allclose(metrics["reward_loss"], rewards.mean(), rtol=1e-5)
 
 
 def test_masking_after_an_end_keeps_the_frame_that_led_to_it():
@@ -89,8 +93,9 @@ def test_masking_after_an_end_keeps_the_frame_that_led_to_it():
     model = small_model(std=0.2, block_teacher_forcing=False)
     _, metrics = losses(model, sequences, config, SPEC)
     frames = sequences.tokens_BTL
-    logits = model.observation_logits(model(frames[:, :-1], sequences.action_BT))
-    loss = nats(logits, model.observation_targets(frames[:, :-1], frames[:, 1:]))
-    weight = np.ones((4, 5, 6))
-    weight[0, 1, 5] = weight[0, 2:] = 0
+    logits = model.observation_logits(model(frames, jnp.pad(sequences.action_BT, ((0, 0), (0, 1)))))
+    behind = jnp.concatenate([frames[:, 1:], frames[:, :1]], axis=1)
+    loss = nats(logits, model.observation_targets(frames, behind))
+    weight = np.ones((4, 6, 6))
+    weight[0, 1, 5] = weight[0, 2:] = weight[:, 5, 5] = 0
     np.testing.assert_allclose(metrics["observation_loss"], (loss * weight).sum() / weight.sum(), rtol=1e-5)

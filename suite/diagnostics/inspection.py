@@ -1,0 +1,181 @@
+"""`suite inspect` of single-agent runs: everything about their world models, side by side, as tables and pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import pandas as pd
+
+from suite import checkpoint
+from suite.agent.dyna import Agent
+from suite.diagnostics import evaluation_set, filmstrips, pictures, symbols
+from suite.diagnostics.evaluation_set import EvaluationSet
+from suite.diagnostics.rollouts import Rollouts, compare, imagine
+from suite.errors import UserError
+from suite.evaluation import agent_for, model_template
+from suite.record import RunRecord, require_writable
+from suite.reporting import Reporter
+from suite.tables import write_whole
+
+STRIPS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Restored:
+    """A run's agent and the newest checkpoint's model, taken after so many real steps."""
+
+    agent: Agent
+    model: dict[str, Any]
+    step: int
+
+
+def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> dict[str, Any]:
+    """Compares the world models of runs on the evaluation set of Section 4.4, and writes what it finds.
+
+    Files: `summary.csv` (a row per run), `steps.csv` (a row per run and step, see `rollouts.compare`), `codes.csv`
+    (codebook over time), `curves.png`, per run `codes-<run>.png`, and filmstrips `rollout-<n>.png` and `.gif`.
+
+    Args:
+      folders: of runs of one single-agent task and preset.
+      out: where to; None: "inspect" in the run's folder, or in the folder that all runs have in common.
+      reporter: where progress goes.
+
+    Returns:
+      "folder" and by run the summary's rows.
+
+    Raises:
+      UserError: no world model, no checkpoint, several tasks or presets, or `out` cannot be written.
+    """
+    records = [RunRecord.open(folder, lock=False) for folder in folders]
+    _check(records)
+    out = out or Path(os.path.commonpath([folder.resolve() for folder in folders])) / "inspect"
+    require_writable(out)
+    config, spec = records[0].config, records[0].spec
+    real = evaluation_set.load(config.task, config.preset, reporter)
+    extractor = symbols.load(config.task, config.preset, reporter) if real.symbols.shape[-1] else None
+    if extractor is not None:
+        reporter.message(f"the symbol extractor reads {100 * extractor.accuracy:.2f} % of validation symbols right")
+    out.mkdir(parents=True, exist_ok=True)
+
+    grid = len(spec.observation.shape) == 3
+    found: dict[str, Rollouts] = {}
+    rows, steps, codes = {}, {}, {}
+    for record, name in zip(records, _names(records), strict=True):
+        reporter.message(f"imagining {len(real.action)} rollouts of {name}")
+        run = restore(record, reporter)
+        world_model, tokenizer = run.model["world_model"], run.model["tokenizer"]
+        found[name] = imagine(run.agent, world_model, tokenizer, real, jax.random.key(0))
+        high = spec.observation.high
+        table, summary = compare(real, found[name], run.agent.tokens, high, extractor)
+        steps[name] = pd.DataFrame(table)
+        codebook = _codebook(record)
+        if len(codebook):
+            codes[name] = codebook
+            summary["codes"] = int(codebook.codes.iloc[-1])
+        if extractor is not None:
+            summary["extractor_percent"] = 100 * extractor.accuracy
+        rows[name] = {"checkpoint": run.step, **summary}
+        used = found[name].codes
+        if grid and used is not None:
+            picture = pictures.code_picture(run.agent.tokenizer, tokenizer, used, spec.observation.shape, high)
+            pictures.save(out / f"codes-{name.replace(' ', '-').replace('/', '-')}.png", picture)
+
+    _write_table(out / "summary.csv", {name: pd.DataFrame([row]) for name, row in rows.items()})
+    _write_table(out / "steps.csv", steps)
+    if codes:
+        _write_table(out / "codes.csv", codes)
+    pictures.curves(out / "curves.png", steps, codes)
+    if grid:
+        _write_strips(out, real, found, records[0])
+    return {"folder": str(out), "runs": rows}
+
+
+def restore(record: RunRecord, reporter: Reporter) -> Restored:
+    """The newest checkpoint of a run.
+
+    Raises:
+      UserError: it has none.
+    """
+    agent = agent_for(record.config, reporter)
+    template = jax.eval_shape(agent.init, jax.random.key(0))
+    restored = checkpoint.restore_latest(record.folder / "checkpoints", model_template(template))
+    if restored is None:
+        raise UserError(_no_checkpoint(record))
+    for warning in restored.warnings:
+        reporter.warning(warning)
+    return Restored(agent, restored.model, restored.step)
+
+
+def _check(records: Sequence[RunRecord]) -> None:
+    first = records[0]
+    for record in records:
+        config = record.config
+        if record.spec.two_player:
+            raise UserError(f"{record.folder} is a run of a two-player game: inspect it apart from the others")
+        if not config.world_model.enabled:
+            raise UserError(f"{record.folder} has no world model: {config.agent} learns from real play only")
+        for field in ("task", "preset"):
+            ours, theirs = getattr(config, field), getattr(first.config, field)
+            if ours != theirs:
+                raise UserError(f"{record.folder} is of {field} {ours}, {first.folder} of {theirs}: inspect them apart")
+        if checkpoint.latest_step(record.folder / "checkpoints") is None:
+            raise UserError(_no_checkpoint(record))
+    folders = [record.folder.resolve() for record in records]
+    for i, folder in enumerate(folders):
+        if folder in folders[:i]:
+            raise UserError(f"{records[i].folder} is named twice")
+
+
+def _no_checkpoint(record: RunRecord) -> str:
+    return f"{record.folder} has no checkpoint to inspect; run it first: suite run {record.config.task}"
+
+
+def _names(records: Sequence[RunRecord]) -> list[str]:
+    """Short names that tell the runs apart: agents, and where that is not enough seeds, and a number."""
+    agents = [record.config.agent for record in records]
+    seeded = [f"{record.config.agent} seed {record.config.seed}" for record in records]
+    names = agents if len(set(agents)) == len(agents) else seeded
+    return names if len(set(names)) == len(names) else [f"{name} ({i + 1})" for i, name in enumerate(names)]
+
+
+def _codebook(record: RunRecord) -> pd.DataFrame:
+    """How many codes the tokenizer had or used over training: columns "step" and "codes", maybe no rows."""
+    path, column = record.folder / "metrics.csv", "tokenizer/codes"
+    table = pd.read_csv(path) if path.exists() and path.stat().st_size else pd.DataFrame()
+    if column not in table:
+        return pd.DataFrame({"step": [], "codes": []})
+    return table[["step", column]].rename(columns={column: "codes"}).dropna()
+
+
+def _write_table(path: Path, tables: dict[str, pd.DataFrame]) -> None:
+    """Tables of runs below each other, the run's name in the first column."""
+    parts = [table.assign(run=name) for name, table in tables.items()]
+    whole = pd.concat(parts, ignore_index=True)
+    whole = whole[["run", *(name for name in whole.columns if name != "run")]]
+    write_whole(path, whole.to_csv(index=False, lineterminator="\n").encode())
+
+
+def _write_strips(out: Path, real: EvaluationSet, found: dict[str, Rollouts], record: RunRecord) -> None:
+    observation = record.spec.observation
+    steps = max(rollouts.steps for rollouts in found.values())
+    for number in filmstrips.choose(real, steps, STRIPS):
+        notes = ["step 0: start"]
+        for t in range(steps):
+            reward = real.reward[number, t]
+            earned = f", reward {reward:+.3g}" if abs(reward) > 1e-6 else ""
+            notes.append(f"step {t + 1}: action {real.action[number, t]}{earned}")
+        strip = filmstrips.Strip(
+            title=f"{record.config.task}, trajectory {number}. Outlined: patches that differ from the real frame.",
+            real=real.frames[number, : steps + 1],
+            imagined={name: rollouts.frames[number] for name, rollouts in found.items()},
+            notes=notes,
+            patch=observation.patch or observation.shape[:2],  # type: ignore[arg-type]
+            high=observation.high,
+        )
+        pictures.save(out / f"rollout-{number:03}.png", filmstrips.filmstrip(strip))
+        filmstrips.film(out / f"rollout-{number:03}.gif", strip)

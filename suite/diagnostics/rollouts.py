@@ -1,0 +1,219 @@
+"""How good a world model's rollouts are, step by step (Section 4.4, Appendix D).
+
+The measures are functions of arrays, so that any model, the environment itself too, can be measured. Shapes: N
+trajectories of T steps, O a frame's own axes, R symbols. `counted` arrays, bool [N, T], say what enters a mean; the
+mean of nothing is nan.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from suite.agent.dyna import Agent
+from suite.diagnostics.evaluation_set import EvaluationSet
+from suite.interface.tokens import TokenizerState, TokenSpec
+from suite.world_model.imagination import Dream
+
+CHUNK = 32  # trajectories imagined together
+BINS = 10  # of probabilities, for calibration
+Read = Callable[[np.ndarray], np.ndarray]  # uint8 [..., O] to int32 [..., R]
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollouts:
+    """What a world model makes of the first T steps of the evaluation set.
+
+    Attributes:
+      frames: uint8 [N, T, O]; imagined from the real first frame and the real actions, each frame from those before.
+      reward, terminated: float32 levels and bool, [N, T]; drawn with them.
+      tokenized: uint8 [N, T + 1, O]; the real frames through the tokenizer alone.
+      reward_odds: float32 [N, T, classes]; probabilities of the reward's classes, given the real frames so far.
+      termination_odds: float32 [N, T]; probability that the episode ends, given the real frames so far.
+      codes: codes that the real frames use; None where tokens are no codes.
+    """
+
+    frames: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    tokenized: np.ndarray
+    reward_odds: np.ndarray
+    termination_odds: np.ndarray
+    codes: np.ndarray | None
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return self.reward.shape[1]
+
+
+def imagine(
+    agent: Agent, world_model: nnx.State, tokenizer: TokenizerState, real: EvaluationSet, key: jax.Array
+) -> Rollouts:
+    """Replays the actions of the evaluation set in a world model, its samples drawn as in training.
+
+    Rollouts are no longer than the model's training sequences: it has never seen more context.
+
+    Args:
+      agent: of a single-agent task.
+      world_model, tokenizer: parameters and state.
+      real: the evaluation set.
+      key: of the samples.
+    """
+    steps = min(real.action.shape[1], agent.config.world_model.sequence_length)
+    parts: list[list[np.ndarray]] = []
+    used: set[int] = set()
+    for start in range(0, len(real.action), CHUNK):
+        frames = real.frames[start : start + CHUNK, : steps + 1]
+        action = real.action[start : start + CHUNK, :steps]
+        missing = [(0, min(CHUNK, len(real.action)) - len(action))]  # one shape, one compilation
+        padded = [np.pad(x, missing + [(0, 0)] * (x.ndim - 1), mode="edge") for x in (frames, action)]
+        found = _imagine(agent, world_model, tokenizer, *padded, jax.random.fold_in(key, start))
+        *arrays, tokens = (np.asarray(x)[: len(action)] for x in jax.device_get(found))
+        parts.append(arrays)
+        shown = np.pad(real.frame_counted[start : start + CHUNK, :steps], ((0, 0), (1, 0)), constant_values=True)
+        if agent.tokenizer.num_codes:
+            used.update(np.unique(tokens[shown]).tolist())
+    codes = np.array(sorted(used)) if agent.tokenizer.num_codes else None
+    return Rollouts(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)), codes=codes)  # type: ignore[misc]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _imagine(
+    agent: Agent,
+    world_model: nnx.State,
+    tokenizer: TokenizerState,
+    frames_NTO: jax.Array,
+    action_NT: jax.Array,
+    key: jax.Array,
+) -> tuple[jax.Array, ...]:
+    """The fields of `Rollouts` in their order, with the real frames' tokens in place of `codes`."""
+    model, horizon = nnx.merge(agent.world_model_graph, world_model), action_NT.shape[1]
+    dream = Dream(model, agent.tokenizer, tokenizer, agent.spec, agent.tokens, horizon, frames_NTO[:, 0])
+    start, _ = dream.reset(key)
+
+    def step(state: Any, inputs: Any) -> Any:
+        step_key, action_N = inputs
+        state, seen = dream.step(step_key, state, action_N)
+        return state, (seen.observation, seen.reward, seen.terminated)
+
+    _, imagined = jax.lax.scan(step, start, (jax.random.split(key, horizon), action_NT.T))
+    tokens_NTL = agent.tokenizer.encode(tokenizer, frames_NTO)
+    hidden = model(tokens_NTL[:, :-1], action_NT)
+    return (
+        *(jnp.swapaxes(x, 0, 1) for x in imagined),
+        agent.tokenizer.decode(tokenizer, tokens_NTL),
+        jax.nn.softmax(model.reward_logits(hidden)),
+        jax.nn.softmax(model.termination_logits(hidden))[..., 1],
+        tokens_NTL,
+    )
+
+
+def compare(
+    real: EvaluationSet, found: Rollouts, tokens: TokenSpec, high: int, read: Read | None
+) -> tuple[list[dict[str, float]], dict[str, float]]:
+    """Rollouts beside reality.
+
+    Args:
+      real: the evaluation set.
+      found: of a model.
+      tokens: tells the classes of rewards.
+      high: largest value of a pixel.
+      read: the symbol extractor; None: symbols are not known.
+
+    Returns:
+      One row per step, and a summary. Errors are squared L2 distances of frames with pixels in [0, 1]: of the rollout,
+      of the tokenizer alone (the least that the rollout can have), and of the first frame `repeated`. Accuracies of
+      symbols are in percent, of the same, and of the extractor on the real frame (the most that a rollout can have).
+      Percents of rewards and terminations that are right; and, for events, that is rewards other than 0 and
+      terminations, how often they come, and how likely they are by the model on the real frames. The summary has means
+      over all steps, precision and recall of the rollouts' events, and the calibration error of their probabilities.
+    """
+    steps = found.steps
+    counted, shown = real.counted[:, :steps], real.frame_counted[:, :steps]
+    after, first = real.frames[:, 1 : steps + 1], real.frames[:, :1]
+    seen = {
+        "": found.frames,
+        "tokenizer_": found.tokenized[:, 1:],
+        "repeated_": np.broadcast_to(first, after.shape),
+    }
+    columns = {f"{name}error": (squared_error(frames, after, high), shown) for name, frames in seen.items()}
+    if read is not None:
+        truth = real.symbols[:, :steps]
+        for name, frames in {**seen, "real_": after}.items():
+            percent = 100 * (read(frames) == truth).mean(-1)
+            columns[f"{name}symbols_percent"] = (percent, shown)
+
+    class_of = {name: np.asarray(tokens.reward_to_class(x)) for name, x in _rewards(real, found).items()}
+    none = int(tokens.reward_to_class(jnp.zeros(())))
+    ended = real.terminated[:, :steps]
+    events = {
+        "reward": (class_of["imagined"], class_of["real"], none, 1 - found.reward_odds[..., none]),
+        "termination": (found.terminated.astype(int), ended.astype(int), 0, found.termination_odds),
+    }
+    summary: dict[str, float] = {}
+    for name, (imagined, true, nothing, odds) in events.items():
+        columns |= {
+            f"{name}_percent": (100.0 * (imagined == true), counted),
+            f"{name}_frequency": (100.0 * (true != nothing), counted),
+            f"{name}_probability": (100.0 * odds, counted),
+        }
+        precision, recall = precision_recall(imagined[counted], true[counted], nothing)
+        summary |= {
+            f"{name}_precision_percent": 100 * precision,
+            f"{name}_recall_percent": 100 * recall,
+            f"{name}_calibration_error": 100 * calibration_error(odds[counted], true[counted] != nothing),
+        }
+    per_step = {name: mean_per_step(*column) for name, column in columns.items()}
+    rows = [{"step": t + 1, **{name: float(values[t]) for name, values in per_step.items()}} for t in range(steps)]
+    overall = {name: _mean(*column) for name, column in columns.items()}
+    all_frames = np.pad(shown, ((0, 0), (1, 0)), constant_values=True)
+    overall["tokenizer_error"] = _mean(squared_error(found.tokenized, real.frames[:, : steps + 1], high), all_frames)
+    codes = {} if found.codes is None else {"codes_used": len(found.codes)}
+    return rows, {"steps": steps, "trajectories": len(counted), **overall, **summary, **codes}
+
+
+def _mean(values: np.ndarray, counted: np.ndarray) -> float:
+    return float(values[counted].mean()) if counted.any() else np.nan
+
+
+def _rewards(real: EvaluationSet, found: Rollouts) -> dict[str, jax.Array]:
+    return {"real": jnp.asarray(real.reward[:, : found.steps]), "imagined": jnp.asarray(found.reward)}
+
+
+def squared_error(frames: np.ndarray, others: np.ndarray, high: int) -> np.ndarray:
+    """Squared L2 distance of frames, uint8 [N, T, O], with values divided by `high`: float64 [N, T]."""
+    difference = (frames.astype(np.float32) - others) / high
+    return np.square(difference, dtype=np.float64).reshape(*frames.shape[:2], -1).sum(-1)
+
+
+def mean_per_step(values: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """Means over trajectories, [T] of [N, T]; nan where nothing counts."""
+    count = counted.sum(0)
+    return np.where(count > 0, np.where(counted, values, 0).sum(0) / np.maximum(count, 1), np.nan)
+
+
+def precision_recall(said: np.ndarray, true: np.ndarray, nothing: int) -> tuple[float, float]:
+    """Share of the events said that are true, and of the true ones that are said; events are all but `nothing`."""
+    right = ((said == true) & (true != nothing)).sum()
+
+    def share(of: np.ndarray) -> float:
+        return float(right / (of != nothing).sum()) if (of != nothing).any() else np.nan
+
+    return share(said), share(true)
+
+
+def calibration_error(probability: np.ndarray, happened: np.ndarray, bins: int = BINS) -> float:
+    """Expected calibration error: mean distance, over bins of equal width, of mean probability and frequency."""
+    if not len(probability):
+        return np.nan
+    bin_of = np.minimum((probability * bins).astype(int), bins - 1)
+    gap = np.bincount(bin_of, probability, bins) - np.bincount(bin_of, happened, bins)
+    return float(np.abs(gap).sum() / len(probability))

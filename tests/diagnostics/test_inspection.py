@@ -1,0 +1,195 @@
+"""`suite inspect` of single-agent runs, on the corridor: the evaluation set, the extractor, tables and pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from suite import checkpoint, registry
+from suite.agent.dyna import Agent
+from suite.diagnostics import evaluation_set, inspection, symbols
+from suite.diagnostics.evaluation_set import Pairs, WithSymbols
+from suite.errors import UserError
+from suite.evaluation import agent_for, model_template
+from suite.record import RunRecord, run_folder
+from suite.registry import Lazy
+from suite.reporting import QuietReporter
+from tests.tiny import CORRIDOR, PENNIES, Corridor
+
+QUIET = QuietReporter()
+MODULE = "tests.diagnostics.test_inspection"
+
+
+def corridor_symbols(state):
+    """Where the walker is, and where not: next to him, ahead."""
+    return jnp.stack([state.position, (state.position + 1) % 4])
+
+
+KNOWN = dataclasses.replace(CORRIDOR, symbols=Lazy(f"{MODULE}:corridor_symbols"), symbol_values=4)
+UNKNOWN = dataclasses.replace(CORRIDOR, id="unknown", family="unknown")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def hasty_compilation():
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def tasks(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "TASKS", (KNOWN, UNKNOWN, PENNIES))
+        patch.setenv("SUITE_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def collected():
+    config = registry.resolve("corridor", "mfrl", "smoke")
+    return evaluation_set.collect(Agent(config, WithSymbols(Corridor(), corridor_symbols)), 40, QUIET)
+
+
+def begun(out, task, agent):
+    """The folder of a run that has not come far."""
+    config = registry.resolve(task, agent, "smoke")
+    with RunRecord.create(run_folder(out, config), config, registry.task(task).spec()) as record:
+        return record.folder
+
+
+def untrained(out, task, agent):
+    """The folder of a run with a checkpoint, made in seconds: the codebook has all there is to see, and no more."""
+    folder = begun(out, task, agent)
+    state = agent_for(registry.resolve(task, agent, "smoke"), QUIET).init(jax.random.key(0))
+    tokenizer = state.tokenizer
+    if agent == "m5":
+        codes_KP = jnp.zeros_like(tokenizer.codes_KP).at[1].set(255)
+        tokenizer = dataclasses.replace(tokenizer, codes_KP=codes_KP, count=jnp.int32(2))
+        with RunRecord.open(folder) as record:
+            record.append_metrics({"step": 32, "tokenizer/codes": 2.0})
+    model = model_template(dataclasses.replace(state, tokenizer=tokenizer))
+    checkpoint.save(folder / "checkpoints", 32, model, {}, {})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs")
+    return [untrained(out, "corridor", agent) for agent in ("m5", "m5_continuous")]
+
+
+def places(frames):
+    """Where the corner of frames [..., 4, 4, 1] is white."""
+    return frames[..., ::2, ::2, 0].reshape(*frames.shape[:-3], 4).argmax(-1)
+
+
+def test_the_evaluation_set(collected):
+    real, pairs = collected
+    count, steps = real.action.shape
+    assert (count, steps) == (12, 8)  # half of six iterations' four rollouts, each of eight steps
+    assert real.frames.shape == (12, 9, 4, 4, 1) and real.symbols.shape == (12, 8, 2)
+    place, after = places(real.frames[:, :-1]), places(real.frames[:, 1:])
+    moved = np.clip(place + 2 * real.action - 1, 0, 3)
+    same_episode = ~real.ended
+    assert real.ended.any() and same_episode.any()
+    assert (moved == after)[same_episode].all()  # an action leads from its frame to the next
+    assert (real.symbols[..., 0] == moved).all()  # also of the frame that an episode ends with
+    assert (real.terminated == (moved == 3)).all() and (real.reward == real.terminated).all()
+    assert (real.symbols[..., 1] == (moved + 1) % 4).all()
+    ended_before = np.array([[row[:t].any() for t in range(steps)] for row in real.ended])
+    assert (real.counted == ~ended_before).all()
+    assert (real.frame_counted == ~(ended_before | real.ended)).all()
+
+    assert len(pairs.frames) == len(pairs.symbols) == 40
+    assert (places(pairs.frames) == pairs.symbols[:, 0]).all()
+    assert 0 < pairs.validation.sum() < 40
+
+
+def test_it_is_built_once(monkeypatch):
+    real = evaluation_set.load("corridor", "smoke", QUIET)
+    extractor = symbols.load("corridor", "smoke", QUIET)
+    monkeypatch.setattr(evaluation_set, "_build", None)
+    monkeypatch.setattr(symbols, "train", None)
+    again = evaluation_set.load("corridor", "smoke", QUIET)
+    assert all((getattr(again, name) == value).all() for name, value in vars(real).items())
+    stored = symbols.load("corridor", "smoke", QUIET)
+    assert stored.accuracy == extractor.accuracy
+    assert (stored(real.frames) == extractor(real.frames)).all()
+    folder = evaluation_set.cache_folder("corridor", "smoke")
+    assert sorted(path.name for path in folder.iterdir()) == ["extractor-1.npz", "pairs.npz", "trajectories.npz"]
+    assert folder != evaluation_set.cache_folder("unknown", "smoke")
+
+
+def test_the_extractor_learns(collected):
+    place = np.random.default_rng(0).integers(0, 4, 400)
+    frames = np.kron(np.eye(4, dtype=np.uint8)[place].reshape(-1, 2, 2, 1), np.full((1, 2, 2, 1), 255, np.uint8))
+    pairs = Pairs(frames, np.stack([place, (place + 1) % 4], -1).astype(np.int32), np.arange(400) >= 300)
+    extractor = symbols.train(pairs, KNOWN.spec().observation, 4, 100, QUIET)
+    assert extractor.accuracy == 1
+    real, _ = collected
+    assert (extractor(real.frames[:, 1:])[real.frame_counted] == real.symbols[real.frame_counted]).all()
+    shuffled = dataclasses.replace(pairs, symbols=np.random.default_rng(1).permutation(pairs.symbols))
+    assert symbols.train(shuffled, KNOWN.spec().observation, 4, 100, QUIET).accuracy < 0.5
+
+
+def test_the_paper_s_network():
+    spec = registry.Lazy("adapters.craftax:CLASSIC_SPEC")().observation
+    network = symbols.nnx.eval_shape(lambda: symbols.Network(spec, 145, 17, symbols.nnx.Rngs(0)))
+    assert network.first.kernel.shape == (7 * 7 * 3, 128) and network.second.kernel.shape == (128, 128)
+    assert network.last.kernel.shape == (81 * 128, 2465)
+
+
+def test_two_runs_side_by_side(runs, tmp_path):
+    found = inspection.inspect(runs, tmp_path / "out", QUIET)
+    out = tmp_path / "out"
+    assert found["folder"] == str(out) and list(found["runs"]) == ["m5", "m5_continuous"]
+    steps, summary = pd.read_csv(out / "steps.csv"), pd.read_csv(out / "summary.csv")
+    assert steps.run.tolist() == ["m5"] * 4 + ["m5_continuous"] * 4  # no more than the sequences that they learn from
+    assert steps.step.tolist() == [1, 2, 3, 4] * 2
+    assert summary.set_index("run").error.to_dict() == {
+        name: pytest.approx(row["error"]) for name, row in found["runs"].items()
+    }
+    assert {"symbols_percent", "real_symbols_percent", "reward_percent", "termination_probability"} <= set(steps)
+    # Patches that are not quantized lose nothing, and a code for white and one for black are all that frames need.
+    assert summary.tokenizer_error.tolist() == [0, 0]
+    assert found["runs"]["m5"]["codes_used"] == 2 and "codes_used" not in found["runs"]["m5_continuous"]
+    assert set(pd.read_csv(out / "codes.csv").run) == {"m5"}
+    pictures = sorted(path.name for path in out.glob("*.png"))
+    assert pictures[:2] == ["codes-m5.png", "curves.png"] and len(pictures) > 2
+    for path in out.iterdir():
+        if path.suffix == ".gif":
+            with Image.open(path) as film:
+                assert film.n_frames == 5
+        elif path.suffix == ".png":
+            with Image.open(path) as image:
+                assert len(image.convert("RGB").getcolors(2**24)) > 2  # not blank
+
+
+def test_one_run_of_a_task_without_symbols(tmp_path):
+    folder = untrained(tmp_path, "unknown", "m5")
+    found = inspection.inspect([folder], None, QUIET)
+    assert found["folder"] == str(folder.resolve() / "inspect")
+    row = found["runs"]["m5"]
+    assert row["error"] >= 0 and not [name for name in row if "symbols" in name or "extractor" in name]
+    assert (folder / "inspect" / "curves.png").exists()
+
+
+def test_what_cannot_be_inspected(runs, tmp_path):
+    for folders, message in (
+        ([begun(tmp_path, "corridor", "mfrl")], "has no world model: mfrl learns from real play only"),
+        ([begun(tmp_path, "corridor", "m5")], "has no checkpoint to inspect; run it first: suite run corridor"),
+        ([runs[0], begun(tmp_path, "unknown", "m5")], "is of task unknown, .* of corridor: inspect them apart"),
+        ([begun(tmp_path, "pennies", "m5"), runs[0]], "is a run of a two-player game: inspect it apart"),
+        ([runs[0], runs[0]], "is named twice"),
+        ([tmp_path], "is no run folder"),
+    ):
+        with pytest.raises(UserError, match=message):
+            inspection.inspect(folders, None, QUIET)
+    with pytest.raises(UserError, match="choose another --out"):
+        inspection.inspect(runs, runs[0] / "record.json" / "x", QUIET)
