@@ -71,7 +71,7 @@ def make_renderer() -> Callable[[Any], jax.Array]:
     blocks = jnp.asarray(_blocks())
     color, alpha = (jnp.asarray(part) for part in _creatures())
     slots = jnp.asarray(_slots())
-    darkness = jnp.asarray(_darkness())
+    darkness = jnp.asarray(view_darkness())
 
     def render(state: Any) -> jax.Array:
         padded = jnp.pad(state.map, MARGIN, constant_values=OUT_OF_BOUNDS)
@@ -190,7 +190,7 @@ def _slots() -> np.ndarray:
     return slots
 
 
-def _darkness() -> np.ndarray:
+def view_darkness() -> np.ndarray:
     """How much of the night's noise lies over each pixel, float32 [49, 63, 1]: none in the middle."""
     y, x = (np.linspace(-1, 1, tiles * TILE) for tiles in VIEW)
     return (1 - np.exp(-0.5 * (y[:, None] ** 2 + x**2) / 0.5**2))[..., None].astype(np.float32)

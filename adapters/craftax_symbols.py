@@ -20,7 +20,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from adapters.craftax_renderer import CENTER, COLUMNS, ITEMS, MARGIN, NEEDS, OUT_OF_BOUNDS, ROWS, TILE, VIEW, _darkness
+from adapters.craftax_renderer import (
+    CENTER,
+    COLUMNS,
+    ITEMS,
+    MARGIN,
+    NEEDS,
+    OUT_OF_BOUNDS,
+    ROWS,
+    TILE,
+    VIEW,
+    view_darkness,
+)
 
 VALUES = 17
 BLANK = 0  # a tile that the night hides, and a tile without a creature
@@ -69,4 +80,4 @@ def _creatures(state: Any, corner: jax.Array) -> jax.Array:
 
 def _tile_darkness() -> np.ndarray:
     """How far each tile of the view lies in the night's noise, float32 [7, 9]: 0 for the player's, nearly 1 outside."""
-    return _darkness().reshape(ROWS, TILE, COLUMNS, TILE).mean(axis=(1, 3))
+    return view_darkness().reshape(ROWS, TILE, COLUMNS, TILE).mean(axis=(1, 3))
