@@ -188,11 +188,7 @@ def _list(args: argparse.Namespace) -> int:
         raise UserError(f"cannot list {args.what!r}; {did_you_mean(args.what, LISTS)}")
     entries: dict[str, Any] = getattr(registry, args.what)()
     rows = {
-        id: [
-            part
-            for part in (entry.summary, *(getattr(entry, name, "") for name in ("row", "cost", "published")))
-            if part
-        ]
+        id: [part for part in (entry.summary, getattr(entry, "cost", ""), _published(entry)) if part]
         for id, entry in entries.items()
     }
     if args.json:
@@ -200,6 +196,13 @@ def _list(args: argparse.Namespace) -> int:
     else:
         _print_table([id, "; ".join(parts)] for id, parts in rows.items())
     return 0
+
+
+def _published(entry: Any) -> str:
+    """What the paper reports of an agent, and where; "" if nothing."""
+    millions = getattr(entry, "millions", None)
+    parts = [getattr(entry, "row", ""), millions and f"{millions} M parameters", getattr(entry, "published", "")]
+    return "; ".join(part for part in parts if part)
 
 
 def _describe(args: argparse.Namespace) -> int:
@@ -230,6 +233,8 @@ def _describe(args: argparse.Namespace) -> int:
     counted = [f"{name.replace('_', ' ')} {description.parameters(name):,}" for name in networks]
     counted.append(f"2 x codebook {description.parameters('codebook'):,} (stored twice in the paper's bookkeeping)")
     print(f"\nTotal: {description.total:,}{' = ' + ' + '.join(counted) if 'codebook' in description.modules else ''}")
+    if published := _published(registry.agent(args.agent)):
+        print(f"Published for craftax_classic: {published}")
     print("\nDerived")
     _print_table([name, f"{value:,}", how] for name, value, how in description.derived)
     return 0

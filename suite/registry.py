@@ -85,6 +85,7 @@ class AgentEntry:
     Attributes:
       row: where the paper reports it, "" if nowhere.
       published: reward and score in percent as published for Craftax-classic at 1M steps, "" if there are none.
+      millions: of parameters, as published; None if they are not.
     """
 
     id: str
@@ -92,6 +93,7 @@ class AgentEntry:
     summary: str
     row: str = ""
     published: str = ""
+    millions: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -176,6 +178,7 @@ AGENTS = (
         "PPO with a GRU on real play only",
         "Table 1, Our best MFRL",
         "reward 55.49 +- 1.33 %, score 16.77 +- 1.11 %",
+        55.6,
     ),
     AgentEntry(
         "mfrl_no_rnn",
@@ -197,6 +200,7 @@ AGENTS = (
         "the PPO of Moon et al. (2023), no memory",
         "Table 1, Previous best MFRL",
         "reward 47.40 +- 0.58 %, score 10.71 +- 0.29 %",
+        4.0,
     ),
     AgentEntry(
         "m1",
@@ -204,6 +208,7 @@ AGENTS = (
         "VQ-VAE, token by token, imagination only",
         "Table 1, M1: Baseline",
         "reward 31.93 +- 2.22 %, score 4.98 +- 0.50 %",
+        60.0,
     ),
     AgentEntry(
         "m2",
@@ -211,6 +216,7 @@ AGENTS = (
         "m1 that learns from real play too (Dyna)",
         "Table 1, M2: M1 + Dyna",
         "reward 43.36 +- 1.84 %, score 8.85 +- 0.63 %",
+        60.0,
     ),
     AgentEntry(
         "m3",
@@ -218,6 +224,7 @@ AGENTS = (
         "m2 with a VQ-VAE of patches",
         "Table 1, M3: M2 + patches",
         "reward 58.92 +- 1.03 %, score 19.36 +- 1.42 %",
+        56.6,
     ),
     AgentEntry(
         "m4",
@@ -225,6 +232,7 @@ AGENTS = (
         "m3 with nearest-neighbor tokens",
         "Table 1, M4: M3 + NNT",
         "reward 64.96 +- 1.13 %, score 25.55 +- 0.86 %",
+        58.5,
     ),
     AgentEntry(
         "m5",
@@ -232,6 +240,7 @@ AGENTS = (
         "m4 with block teacher forcing",
         "Table 1, M5: M4 + BTF (fast)",
         "reward 67.42 +- 0.55 %, score 27.91 +- 0.63 %",
+        58.5,
     ),
     AgentEntry(
         "m5_slow",
@@ -239,6 +248,7 @@ AGENTS = (
         "m5 with eight times the world-model updates",
         "Table 1, M5: M4 + BTF (slow)",
         "reward 69.66 +- 1.20 %, score 31.77 +- 1.43 %",
+        58.5,
     ),
     AgentEntry(
         "m5_patch5",

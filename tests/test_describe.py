@@ -38,6 +38,8 @@ def test_counts_are_the_papers(m5):
         ("m2", 60_032_287, 60.0),
         ("m3", 56_564_143, 56.6),
         ("m4", 58_503_964, 58.5),
+        ("m5", 58_503_964, 58.5),
+        ("m5_slow", 58_503_964, 58.5),
         ("mfrl", 55_599_768, 55.6),
         ("mfrl_prior", 3_951_122, 4.0),
     ],
@@ -45,7 +47,7 @@ def test_counts_are_the_papers(m5):
 def test_each_rungs_count_is_the_papers(agent, total, millions):
     """Table 1, and the fidelity notes' table of parameter counts."""
     found = described(agent).total
-    assert found == total and round(found / 1e6, 1) == millions
+    assert found == total and round(found / 1e6, 1) == millions == registry.agent(agent).millions
 
 
 def test_a_vq_vae_counts_networks_once_and_its_codebook_twice():
