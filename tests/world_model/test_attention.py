@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
+from suite.world_model.attention import _attend_cached, cached_attention, causal_attention, rope, token_positions
 
 
 def inputs(steps: int = 5, block: int = 7, heads: int = 2, width: int = 4) -> tuple[jax.Array, ...]:
@@ -73,8 +73,13 @@ def test_large_scores_do_not_overflow():
 
 def test_cached_attention_sees_only_what_is_filled():
     query, key, value = inputs(steps=3)
-    mixed = cached_attention(query[:, 7:14], key.swapaxes(1, 2), value.swapaxes(1, 2), jnp.full(7, 13))
-    np.testing.assert_allclose(mixed, masked_attention(query, key, value, 7)[:, 7:14], atol=1e-6)
+    for new in (slice(7, 14), slice(13, 14)):  # a block, and a single token
+        last_Q = jnp.full(new.stop - new.start, 13)
+        mixed = cached_attention(query[:, new], key.swapaxes(1, 2), value.swapaxes(1, 2), last_Q)
+        np.testing.assert_allclose(mixed, masked_attention(query, key, value, 7)[:, new], atol=1e-6)
+        # On other devices all streams at once.
+        together = _attend_cached(query[:, new], key.swapaxes(1, 2), value.swapaxes(1, 2), last_Q)
+        np.testing.assert_allclose(together, mixed, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["flat", "grid"])
