@@ -119,10 +119,15 @@ _agents: dict[Config, Agent] = {}  # the last one built
 
 
 def agent_for(config: Config, reporter: Reporter) -> Agent:
-    """The agent of a configuration. Configurations that differ by seed share one, and its compiled programs."""
+    """The agent of a configuration. Configurations that differ by seed share one, and its compiled programs.
+
+    Those of the agent before are dropped: they would stay for good, and on a CPU each agent's are thousands of memory
+    maps, of which Linux gives a process 65,530. XLA crashes where they end.
+    """
     unseeded = dataclasses.replace(config, seed=0)
     if unseeded not in _agents:
         _agents.clear()
+        jax.clear_caches()
         enable_compilation_cache()
         environment = registry.task(config.task).make()(progress=reporter.texture)
         _agents[unseeded] = Agent(unseeded, environment)
