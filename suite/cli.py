@@ -8,6 +8,7 @@ before the words of the command are known to be right.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import math
 import numbers
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from suite.reporting import Reporter
     from suite.run import Result
 
-COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "bench")
+COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "compare", "bench")
 LISTS = ("tasks", "agents", "presets")
 BAD_INPUT, FAILED, STOPPED = 2, 1, 130
 
@@ -68,7 +69,7 @@ def _dispatch(argv: list[str]) -> int:
         raise UserError(f"unexpected argument {rest[0]!r}")
     if rest:
         args.overrides = [*args.overrides, *rest]
-    functions = (_run, _list, _describe, _evaluate, _inspect, _bench)
+    functions = (_run, _list, _describe, _evaluate, _inspect, _compare, _bench)
     return dict(zip(COMMANDS, functions, strict=True))[args.command](args)
 
 
@@ -83,6 +84,7 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
         "describe": "the whole configuration, layers and parameter counts, without running anything",
         "evaluate": "play whole episodes with a run's newest checkpoint",
         "inspect": "how good world models are: rollouts beside reality; of games, whether they keep the rules",
+        "compare": "finished runs: scores and curves, mean and standard error over seeds, as Markdown tables",
         "bench": "time, share and speed of each phase",
     }
     commands = {
@@ -105,6 +107,10 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
     inspect = commands["inspect"]
     inspect.add_argument("--games", type=int, default=1000, metavar="N", help="games to imagine (default 1000)")
     inspect.add_argument("--out", type=Path, metavar="DIR", help="where to (default: inspect, where the runs are)")
+    compare = commands["compare"]
+    compare.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="runs in or below it are compared")
+    compare.add_argument("--parts", type=int, default=5, metavar="N", help="points of a curve (default 5)")
+    compare.add_argument("--score", metavar="S", help="what curves are of (default: return, or the first score)")
     for name in ("run", "evaluate", "inspect", "bench"):
         commands[name].add_argument("--quiet", action="store_true", help="no progress")
     for command in commands.values():
@@ -310,6 +316,25 @@ def _inspect_rollouts(args: argparse.Namespace) -> int:
     print(f"tables, curves and filmstrips in {found['folder']}")
     if args.json:
         _print_json(found)
+    return 0
+
+
+def _compare(args: argparse.Namespace) -> int:
+    if args.parts < 1:
+        raise UserError(f"--parts={args.parts}: must be at least 1")
+
+    from leaderboards.compare import compare, records_in, tables
+
+    comparisons = compare(records_in(args.folders), args.parts, args.score)
+    for found in comparisons:
+        print(f"{found.task}, preset {found.preset}, {found.steps:,} steps\n")
+        for table in tables(found):
+            head = list(map(str, table.columns))
+            for row in (head, ["---"] * len(head), *table.to_numpy().tolist()):
+                print(f"| {' | '.join(row)} |")
+            print()
+    if args.json:
+        _print_json([dataclasses.asdict(found) for found in comparisons])
     return 0
 
 

@@ -10,18 +10,16 @@ from suite import registry, run
 from suite.reporting import QuietReporter
 from tests.tiny import WIDE_CORRIDOR
 
-SAME_PROGRAMS = {"m5_slow", "m5_tbp0", "m5_annealed", "m5_no_btf"}  # as m5 or m4 but for numbers; tested as settings
-
 
 @pytest.fixture(autouse=True, scope="module")
 def hasty_compilation():
-    """Sixteen agents are compiled here to run for a moment each."""
+    """Twenty agents are compiled here to run for a moment each."""
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
 
 
-@pytest.mark.parametrize("agent", sorted(registry.agents().keys() - SAME_PROGRAMS))
+@pytest.mark.parametrize("agent", sorted(registry.agents()))
 def test_two_iterations(agent, tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
     config = registry.resolve("wide_corridor", agent, "smoke")
