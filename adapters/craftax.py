@@ -5,13 +5,13 @@ Importing this module loads no game and touches no device; `make_classic` does.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from adapters.numerics import like, loose_numerics, strong
 from suite.interface.environment import Environment, EnvironmentSpec, ObservationSpec, TimeStep
 
 CLASSIC_SPEC = EnvironmentSpec(
@@ -88,22 +88,21 @@ class CraftaxClassic:
 
     def reset(self, key: jax.Array) -> tuple[Any, TimeStep]:
         """A freshly generated world."""
-        with _craftax_numerics():
+        with loose_numerics():
             state = self._generate_world(key, self._params, self._sizes)
-        state = jax.tree.map(_strong, state)
+        state = jax.tree.map(strong, state)
         no = jnp.zeros((), bool)
         return state, self._time_step(state, jnp.zeros(()), terminated=no, truncated=no, first=~no)
 
     def step(self, key: jax.Array, state: Any, action: jax.Array) -> tuple[Any, TimeStep]:
         """One step of the game."""
-        with _craftax_numerics():
+        with loose_numerics():
             stepped, reward = self._game.craftax_step(key, state, action, self._params, self._sizes)
             over = self._game.is_game_over(stepped, self._params)
-        # In the types of `state`, so that a compiled step can be fed its own output.
-        stepped = jax.tree.map(lambda new, old: _strong(new, old.dtype), stepped, state)
+        stepped = like(stepped, state)
         truncated = (stepped.timestep >= self._params.max_timesteps) & (stepped.player_health > 0)
         flags = {"terminated": over & ~truncated, "truncated": truncated, "first": jnp.zeros((), bool)}
-        return stepped, self._time_step(stepped, _strong(reward, jnp.dtype(jnp.float32)), **flags)
+        return stepped, self._time_step(stepped, strong(reward, jnp.dtype(jnp.float32)), **flags)
 
     def _time_step(self, state: Any, reward: jax.Array, **flags: Any) -> TimeStep:
         observation = jnp.round(self._render(state)).astype(jnp.uint8)
@@ -140,19 +139,19 @@ class BuiltInAutoReset:
 
     def reset(self, key: jax.Array) -> tuple[Any, TimeStep]:
         """First time steps of B episodes; every array leads with B."""
-        with _craftax_numerics():
+        with loose_numerics():
             frame_B, state = jax.vmap(self._game.reset)(jax.random.split(key, self.num_envs))
-        state = jax.tree.map(_strong, state)
+        state = jax.tree.map(strong, state)
         no_B = jnp.zeros(self.num_envs, bool)
         return state, self._time_step(frame_B, state, jnp.zeros(self.num_envs), no_B, ~no_B)
 
     def step(self, key: jax.Array, state: Any, action_B: jax.Array) -> tuple[Any, TimeStep]:
         """One step of each environment, and B new worlds of which those that ended get theirs."""
         keys_B = jax.random.split(key, self.num_envs)
-        with _craftax_numerics():
+        with loose_numerics():
             frame_B, stepped, reward_B, done_B, _ = jax.vmap(self._game.step)(keys_B, state, action_B)
-        stepped = jax.tree.map(lambda new, old: _strong(new, old.dtype), stepped, state)
-        return stepped, self._time_step(frame_B, stepped, _strong(reward_B, jnp.dtype(jnp.float32)), done_B, done_B)
+        stepped = like(stepped, state)
+        return stepped, self._time_step(frame_B, stepped, strong(reward_B, jnp.dtype(jnp.float32)), done_B, done_B)
 
     def _time_step(self, frame_B, state, reward_B, terminated_B, first_B) -> TimeStep:
         observation_B = jnp.round(frame_B * 255).astype(jnp.uint8)
@@ -173,18 +172,3 @@ def _statistics(state: Any) -> dict[str, jax.Array]:
         "achievement_return": state.achievements.sum(dtype=jnp.float32),
         "health_return": HEALTH_REWARD * (state.player_health - START_HEALTH).astype(jnp.float32),
     }
-
-
-@contextlib.contextmanager
-def _craftax_numerics() -> Iterator[None]:
-    """Craftax mixes types and ranks as NumPy does, whatever stricter rules the caller is traced under."""
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        yield
-
-
-def _strong(value: Any, dtype: Any = None) -> jax.Array:
-    """`value` as an array whose type does not give way to others: jax's weak types compile once more."""
-    array = jnp.asarray(value)
-    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
-        return array
-    return jax.lax.convert_element_type(array, dtype or array.dtype)

@@ -49,6 +49,7 @@ CRAFTAX_CLASSIC_SMALL: dict[str, Any] = {
     "imagination.horizon": 5,
     "imagination.num_envs": 32,
     "imagination.updates": 5,
+    "evaluation.episodes": 16,
     "checkpoint.every_steps": 10_000,
 }
 
@@ -81,6 +82,7 @@ CRAFTAX_CLASSIC_SMOKE: dict[str, Any] = {
     "imagination.horizon": 3,
     "imagination.num_envs": 4,
     "imagination.updates": 2,
+    "evaluation.episodes": 4,
     "checkpoint.every_steps": 32,
 }
 
@@ -122,6 +124,7 @@ OPENSPIEL_SMALL: dict[str, Any] = {
     "imagination.horizon": 4,
     "imagination.num_envs": 48,
     "imagination.updates": 10,
+    "evaluation.episodes": 16,
 }
 
 # 187 tokens an event, and episodes of five: a shallow model that sees many short sequences learns most in the time.
@@ -156,7 +159,56 @@ OPENSPIEL_SMOKE: dict[str, Any] = {
     "imagination.horizon": 4,
     "imagination.num_envs": 4,
     "imagination.updates": 2,
+    "evaluation.episodes": 4,
     "checkpoint.every_steps": 48,
+}
+
+
+# The paper's tables for MinAtar ("MFRL changes", "MBRL changes"); what they leave out is as for Craftax-classic.
+MINATAR_PAPER: dict[str, Any] = {
+    "policy.cnn_norm": "layer",
+    "policy.activation": "swish",
+    "policy.shared_trunk": True,
+    "ppo.discount": 0.95,
+    "ppo.gae_lambda": 0.75,
+    "ppo.target_decay": 0.925,
+    "world_model.updates": 2_000,
+    "world_model.reward_weight": 10.0,
+    "imagination.updates": 2_000,
+    "imagination.entropy_coefficient": 0.05,
+}
+
+MINATAR_SMALL: dict[str, Any] = {
+    "protocol.steps": 102_400,  # 100 iterations of 16 x 64
+    "environment.num_envs": 16,
+    "environment.rollout_length": 64,
+    "policy.cnn_channels": (16, 32),
+    "policy.blocks_per_stack": 1,
+    "policy.convs_per_block": 1,
+    "policy.hidden_size": 128,
+    "policy.dense_blocks": 1,
+    "policy.rnn_size": 64,
+    "ppo.minibatches": 4,
+    "replay.capacity": 32_000,
+    "tokenizer.codebook_size": 512,
+    "tokenizer.embed_dim": 32,
+    "tokenizer.channels": (16, 16, 32, 32, 32),
+    "world_model.embed_dim": 64,
+    "world_model.layers": 2,
+    "world_model.heads": 4,
+    "world_model.dropout": 0.0,
+    "world_model.initial_std": 0.1,
+    "world_model.sequence_length": 6,
+    "world_model.sequences": 8,
+    "world_model.minibatches": 2,
+    "world_model.updates": 40,
+    "imagination.start_step": 20_000,
+    "imagination.horizon": 6,
+    "imagination.num_envs": 48,
+    "imagination.updates": 10,
+    "evaluation.every_steps": 20_000,
+    "evaluation.episodes": 16,
+    "checkpoint.every_steps": 20_000,
 }
 
 
@@ -219,6 +271,21 @@ def _without_needless_memory(config: Config) -> Config:
 
         observed = fully_observed(config.task.partition("/")[2])
     return apply_changes(config, {"policy.rnn_size": 0}) if observed else config
+
+
+def minatar_paper(config: Config) -> Config:
+    """Tables "MFRL changes for MinAtar" and "MBRL changes for MinAtar", the same for all games."""
+    return apply_changes(config, MINATAR_PAPER)
+
+
+def minatar_small(config: Config) -> Config:
+    """A tenth of the paper's budget, with a network and numbers of updates for two CPU cores."""
+    return apply_changes(config, MINATAR_PAPER | MINATAR_SMALL)
+
+
+def minatar_smoke(config: Config) -> Config:
+    """Two iterations, the second one with imagination."""
+    return apply_changes(config, MINATAR_PAPER | CRAFTAX_CLASSIC_SMOKE)
 
 
 def craftax_classic_small(config: Config) -> Config:

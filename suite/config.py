@@ -161,6 +161,14 @@ class ImaginationConfig:
 
 
 @config_class
+class EvaluationConfig:
+    """Whole episodes beside training (Section 4.6, fidelity note 31). They change nothing of it: not hashed."""
+
+    every_steps: NotNegative = 50_000  # and after the last one; 0: only then
+    episodes: Positive = 32  # at least; the first one of each environment, in batches of `environment.num_envs`
+
+
+@config_class
 class CheckpointConfig:
     """How often a run saves itself. Not part of the protocol."""
 
@@ -184,6 +192,7 @@ class Config:
     tokenizer: TokenizerConfig = TokenizerConfig()
     world_model: WorldModelConfig = WorldModelConfig()
     imagination: ImaginationConfig = ImaginationConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
 
     def __post_init__(self) -> None:
@@ -219,9 +228,9 @@ class Config:
         return json.loads(json.dumps(dataclasses.asdict(self)))
 
     def digest(self) -> str:
-        """Identifies a run up to what may change without changing its results (checkpoint intervals)."""
+        """Identifies a run up to what may change without changing its results (when it is evaluated and saved)."""
         fields = self.as_dict()
-        del fields["checkpoint"]
+        del fields["checkpoint"], fields["evaluation"]
         return hash_of(fields)
 
 

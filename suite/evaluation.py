@@ -92,7 +92,7 @@ def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str
 
     Args:
       folder: a run folder.
-      episodes: at least so many; None: one per environment.
+      episodes: at least so many; None: `evaluation.episodes`.
       reporter: where progress goes.
 
     Returns:
@@ -111,8 +111,7 @@ def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str
         for warning in restored.warnings:
             reporter.warning(warning)
         learner = Learner(params=restored.model["policy"], optimizer=None, targets=restored.model["targets"])
-        count = episodes or config.environment.num_envs
-        return record_evaluation(record, agent, learner, restored.step, count)
+        return record_evaluation(record, agent, learner, restored.step, episodes or config.evaluation.episodes)
 
 
 _agents: dict[Config, Agent] = {}  # the last one built
@@ -136,15 +135,15 @@ def agent_for(config: Config, reporter: Reporter) -> Agent:
 
 def record_evaluation(record: RunRecord, agent: Agent, learner: Learner, step: int, episodes: int) -> dict[str, Any]:
     """Plays whole episodes with the policy of `step`, records them, and returns their scores."""
-    rows = play_episodes(agent, learner, evaluation_key(record.config), episodes)
+    rows = play_episodes(agent, learner, evaluation_key(record.config, step), episodes)
     record.append_evaluation({**row, "step": step} for row in rows)
     scores = registry.task(record.config.task).scores()(pd.DataFrame(rows), None, agent.spec)
     return {"step": step, "episodes": len(rows), **scores}
 
 
-def evaluation_key(config: Config) -> jax.Array:
-    """Randomness of evaluation, apart from training's."""
-    return jax.random.fold_in(jax.random.key(config.seed), 1)
+def evaluation_key(config: Config, step: int) -> jax.Array:
+    """Randomness of the evaluation at a step, apart from training's."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), 1), step)
 
 
 def model_template(state: Any) -> dict[str, Any]:

@@ -348,7 +348,7 @@ def _acquire(folder: Path) -> IO[str]:
 def _require_same_run(folder: Path, stored: Config, asked: Config) -> None:
     old, new = dotted(stored), dotted(asked)
     for name in new:
-        if old[name] != new[name] and not name.startswith("checkpoint."):
+        if old[name] != new[name] and not name.startswith(("checkpoint.", "evaluation.")):
             raise UserError(f"{folder} holds a run with {name}={old[name]}, not {new[name]}; choose another --out")
 
 

@@ -89,8 +89,10 @@ class _Training:
                 while not self.done and not self.stop_requested:
                     before = self.steps
                     state = self._iterate(state)
-                    every = self.config.checkpoint.every_steps
-                    if self.steps // every > before // every or self.stop_requested:
+                    # Before the checkpoint: what is evaluated after it would be missing if the run died in between.
+                    if self._passed(before, self.config.evaluation.every_steps):
+                        self._evaluate(state)
+                    if self._passed(before, self.config.checkpoint.every_steps) or self.stop_requested:
                         self._save(state)
                 if self.done:
                     self._finish(state)
@@ -103,6 +105,10 @@ class _Training:
             self.reporter.stop()
             self.record.add_wall_clock(time.monotonic() - started, self.seconds)
         return _result(self.record, "finished" if self.record.finished else "stopped")
+
+    def _passed(self, before: int, every: int) -> bool:
+        """Whether the last iteration, begun at step `before`, reached another multiple of `every` (0: of nothing)."""
+        return bool(every) and self.steps // every > before // every
 
     def _restore(self) -> TrainState:
         init_key = jax.random.fold_in(self.key, 0)
@@ -187,6 +193,14 @@ class _Training:
                 raise RunError(f"{name} became {value} in phase {phase} at step {self.steps:,}; {where}")
         return found
 
+    def _evaluate(self, state: TrainState) -> None:
+        """Plays whole episodes with the present policy, unless there are some of this step already."""
+        if self.record.has_evaluation(self.steps):
+            return
+        with self._phase("evaluate"):
+            episodes = self.config.evaluation.episodes
+            record_evaluation(self.record, self.agent, state.learner.acting, self.steps, episodes)
+
     def _save(self, state: TrainState) -> None:
         with self._phase("checkpoint"):
             host = {"iteration": self.iteration, "steps": self.steps, "seconds": self.seconds}
@@ -197,10 +211,7 @@ class _Training:
         """Saves the last checkpoint, plays the final evaluation, and closes the record."""
         if checkpoint.latest_step(self.checkpoints) != self.steps:
             self._save(state)
-        if not self.record.has_evaluation(self.steps):  # or an earlier process was killed right after it
-            with self._phase("evaluate"):
-                episodes = self.config.environment.num_envs
-                record_evaluation(self.record, self.agent, state.learner.acting, self.steps, episodes)
+        self._evaluate(state)
         self.record.finish(self.steps)
         checkpoint.drop_resume(self.checkpoints)
 

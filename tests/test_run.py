@@ -153,6 +153,19 @@ def test_the_first_episodes_of_an_evaluation_are_whole(tmp_path, uninterrupted):
     assert len(rows) == 4 + 12  # the run's own, and these
 
 
+def test_evaluations_beside_training_leave_it_as_it_is(tmp_path, uninterrupted):
+    settings = config("m5", "evaluation.every_steps=64", "evaluation.episodes=8")
+    with pytest.raises(Killed):
+        run.run(settings, tmp_path, KillAt("checkpoint", 2))  # the evaluation before it is thrown away
+    folder = run.run(settings, tmp_path, QuietReporter()).folder
+    for name in ("episodes.csv", "metrics.csv"):
+        assert (folder / name).read_bytes() == (uninterrupted.folder / name).read_bytes()
+    rows = pd.read_csv(folder / "evaluations.csv")
+    assert rows["step"].value_counts(sort=False).to_dict() == {64: 8, 128: 8, 192: 8}
+    rounds = [part.drop(columns="step").to_numpy().tolist() for _, part in rows.groupby("step")]
+    assert rounds[0] != rounds[1]  # randomness of their own
+
+
 def test_without_a_world_model_nothing_of_it_exists(tmp_path):
     result = run.run(config("mfrl"), tmp_path, QuietReporter())
     columns = pd.read_csv(result.folder / "metrics.csv").columns

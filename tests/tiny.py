@@ -198,6 +198,7 @@ def corridor_smoke(config: Config) -> Config:
         "imagination.horizon": 3,
         "imagination.num_envs": 4,
         "imagination.updates": 2,
+        "evaluation.episodes": 4,
         "checkpoint.every_steps": 64,
     }
     return apply_changes(config, changes)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from adapters.craftax import _craftax_numerics
 from adapters.craftax_renderer import make_renderer, uniform
+from adapters.numerics import loose_numerics
 
 FRAMES = 512
 ROUNDING = 1e-4  # of 255: the last bits of float32
@@ -19,13 +19,13 @@ def make_original():
     from craftax.craftax_classic import constants, renderer
 
     size = constants.BLOCK_PIXEL_SIZE_AGENT
-    with pytest.MonkeyPatch.context() as patch, _craftax_numerics():
+    with pytest.MonkeyPatch.context() as patch, loose_numerics():
         textures = {size: constants.load_all_textures_given_size(size)}
         patch.setattr(renderer, "load_all_textures", lambda: textures)
         render = renderer.make_craftax_pixel_renderer(size)
 
     def original(state):
-        with _craftax_numerics():
+        with loose_numerics():
             return render(state)
 
     return original

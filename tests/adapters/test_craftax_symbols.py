@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from adapters.craftax import _craftax_numerics
 from adapters.craftax_renderer import ITEMS, NEEDS
 from adapters.craftax_symbols import ARROW, PLAYER, VALUES, classic_symbols
+from adapters.numerics import loose_numerics
 from suite import registry
 from tests.adapters.test_craftax_renderer import arbitrary_state
 
@@ -36,7 +36,7 @@ def test_as_craftax_says(states):
     symbols = np.asarray(jax.jit(jax.vmap(classic_symbols))(day))
     assert symbols.shape == (64, 145) and symbols.dtype == np.int32
     assert symbols.min() >= 0 and symbols.max() < VALUES == registry.task("craftax_classic").symbol_values
-    with _craftax_numerics():
+    with loose_numerics():
         theirs = np.asarray(jax.vmap(render_craftax_symbolic)(day), np.float32)
     tiles = theirs[:, : 63 * 21].reshape(64, 63, 21)
     assert (tiles[..., :17].argmax(-1) == symbols[:, BLOCKS]).all()

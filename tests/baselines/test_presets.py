@@ -71,6 +71,8 @@ NOTES = {
     "ppo.target_spread": "deviation",  # 8
     "ppo.adam_eps": 1e-5,  # 9
     "ppo.learn_from_real": True,
+    "evaluation.every_steps": 50_000,  # Section 4.6
+    "evaluation.episodes": 32,
 }
 MODEL_NOTES = {
     "tokenizer.kind": "nearest_neighbor",
@@ -243,6 +245,26 @@ def test_schedule_of_imagined_updates():
     linear = ["imagination.schedule=linear", "imagination.start_step=0", "imagination.updates=300"]
     config = registry.resolve("craftax_classic", "m5", "paper", linear)
     assert [config.imagined_updates(step) for step in (0, 500_000, 1_000_000)] == [0, 150, 300]
+
+
+@pytest.mark.parametrize("game", ["asterix", "breakout", "freeway", "space_invaders"])
+def test_minatar_differs_from_craftax_in_what_the_paper_says_and_in_nothing_else(game):
+    """Tables "MFRL changes for MinAtar" and "MBRL changes for MinAtar"."""
+    ours = dotted(registry.resolve(f"minatar/{game}", "m5", "paper"))
+    different = {name: value for name, value in ours.items() if value != settings("m5")[name]}
+    assert different == {
+        "task": f"minatar/{game}",
+        "policy.cnn_norm": "layer",
+        "policy.activation": "swish",
+        "policy.shared_trunk": True,
+        "ppo.discount": 0.95,
+        "ppo.gae_lambda": 0.75,
+        "ppo.target_decay": 0.925,
+        "world_model.updates": 2_000,
+        "world_model.reward_weight": 10.0,
+        "imagination.updates": 2_000,
+        "imagination.entropy_coefficient": 0.05,
+    }
 
 
 @pytest.mark.parametrize(

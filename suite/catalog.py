@@ -1,0 +1,242 @@
+"""The tasks, agents and presets of this distribution. Importing this imports neither JAX nor any game."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from suite.entries import AgentEntry, Lazy, Made, PresetEntry, TaskEntry
+
+
+def _game(name: str, summary: str = "", cost: str = "") -> TaskEntry:
+    return TaskEntry(
+        id=f"openspiel/{name}",
+        family="openspiel",
+        summary=summary or f"{name} of OpenSpiel against a uniform opponent, both seats",
+        spec=Made("adapters.openspiel:spec", (name,)),
+        make=Lazy("adapters.openspiel:make", (name,)),
+        scores=Lazy("leaderboards.scoring:games"),
+        presets={
+            "paper": Lazy("baselines.presets:openspiel_paper"),
+            "small": Lazy("baselines.presets:openspiel_small"),
+            "smoke": Lazy("baselines.presets:openspiel_smoke"),
+        },
+        cost=cost,
+    )
+
+
+def _minatar(name: str, summary: str) -> TaskEntry:
+    return TaskEntry(
+        id=f"minatar/{name}",
+        family="minatar",
+        summary=summary,
+        spec=Made("adapters.minatar:spec", (name,)),
+        make=Lazy("adapters.minatar:make", (name,)),
+        scores=Lazy("leaderboards.scoring:returns"),
+        presets={
+            "paper": Lazy("baselines.presets:minatar_paper"),
+            "small": Lazy("baselines.presets:minatar_small"),
+            "smoke": Lazy("baselines.presets:minatar_smoke"),
+        },
+    )
+
+
+def _foreign(family: str, name: str, scores: str) -> TaskEntry:
+    return TaskEntry(
+        id=f"{family}/{name}",
+        family=family,
+        summary=f"{name} of {family}",
+        spec=Made(f"adapters.{family}_bridge:spec", (name,)),
+        make=Lazy(f"adapters.{family}_bridge:make", (name,)),
+        scores=Lazy(f"leaderboards.scoring:{scores}"),
+        presets={
+            "small": Lazy("baselines.presets:foreign_small"),
+            "smoke": Lazy("baselines.presets:foreign_smoke"),
+        },
+        cost="",
+    )
+
+
+# Families with more tasks than are listed: any game of the library by its id.
+FAMILIES: dict[str, Callable[[str], TaskEntry]] = {
+    "openspiel": _game,
+    "gymnasium": lambda name: _foreign("gymnasium", name, "returns"),
+    "pettingzoo": lambda name: _foreign("pettingzoo", name, "games"),
+}
+
+TASKS = (
+    _game("tic_tac_toe", "tic-tac-toe against a uniform opponent, both seats: 27 symbols, 9 actions"),
+    _game("leduc", "Leduc poker against a uniform opponent, both seats: 16 symbols, 3 actions, 6 chance outcomes"),
+    _game("bargaining", "bargaining, uniform opponent, both seats: 93 symbols, 121 actions, 1002 chance outcomes"),
+    _minatar("asterix", "MinAtar's Asterix: gold and enemies; 10x10x4, 5 actions"),
+    _minatar("breakout", "MinAtar's Breakout; 10x10x4, 3 actions"),
+    _minatar("freeway", "MinAtar's Freeway: cross between cars; 10x10x7, 3 actions"),
+    _minatar("space_invaders", "MinAtar's Space Invaders; 10x10x6, 4 actions"),
+    TaskEntry(
+        id="craftax_classic",
+        family="craftax_classic",
+        summary="Craftax-classic from 63x63 pixels: 17 actions, 22 achievements",
+        spec=Lazy("adapters.craftax:CLASSIC_SPEC"),
+        make=Lazy("adapters.craftax:make_classic"),
+        scores=Lazy("leaderboards.scoring:craftax"),
+        presets={
+            "paper": Lazy("baselines.presets:paper"),
+            "small": Lazy("baselines.presets:craftax_classic_small"),
+            "smoke": Lazy("baselines.presets:craftax_classic_smoke"),
+        },
+        own_auto_reset=Lazy("adapters.craftax:BuiltInAutoReset"),
+        symbols=Lazy("adapters.craftax_symbols:classic_symbols"),
+        symbol_values=17,
+        cost="small on two CPU cores: m5 6 min, mfrl 2 min, random 15 s, 2.3 GiB; paper: an accelerator",
+    ),
+)
+
+AGENTS = (
+    AgentEntry("random", Lazy("baselines.random_policy:random"), "uniform over actions, learns nothing"),
+    AgentEntry(
+        "mfrl",
+        Lazy("baselines.model_free:mfrl"),
+        "PPO with a GRU on real play only",
+        "Table 1, Our best MFRL",
+        "reward 55.49 +- 1.33 %, score 16.77 +- 1.11 %",
+        55.6,
+    ),
+    AgentEntry(
+        "mfrl_no_rnn",
+        Lazy("baselines.model_free:mfrl_no_rnn"),
+        "mfrl without the GRU",
+        "Table 2, Remove RNN",
+        "reward 41.82 +- 0.97 %, score 8.33 +- 0.44 %",
+    ),
+    AgentEntry(
+        "mfrl_small",
+        Lazy("baselines.model_free:mfrl_small"),
+        "mfrl with a smaller network",
+        "Table 2, Smaller model",
+        "reward 51.35 +- 0.80 %, score 12.93 +- 0.56 %",
+    ),
+    AgentEntry(
+        "mfrl_prior",
+        Lazy("baselines.model_free:mfrl_prior"),
+        "the PPO of Moon et al. (2023), no memory",
+        "Table 1, Previous best MFRL",
+        "reward 47.40 +- 0.58 %, score 10.71 +- 0.29 %",
+        4.0,
+    ),
+    AgentEntry(
+        "m1",
+        Lazy("baselines.ladder:m1"),
+        "VQ-VAE, token by token, imagination only",
+        "Table 1, M1: Baseline",
+        "reward 31.93 +- 2.22 %, score 4.98 +- 0.50 %",
+        60.0,
+    ),
+    AgentEntry(
+        "m2",
+        Lazy("baselines.ladder:m2"),
+        "m1 that learns from real play too (Dyna)",
+        "Table 1, M2: M1 + Dyna",
+        "reward 43.36 +- 1.84 %, score 8.85 +- 0.63 %",
+        60.0,
+    ),
+    AgentEntry(
+        "m3",
+        Lazy("baselines.ladder:m3"),
+        "m2 with a VQ-VAE of patches",
+        "Table 1, M3: M2 + patches",
+        "reward 58.92 +- 1.03 %, score 19.36 +- 1.42 %",
+        56.6,
+    ),
+    AgentEntry(
+        "m4",
+        Lazy("baselines.ladder:m4"),
+        "m3 with nearest-neighbor tokens",
+        "Table 1, M4: M3 + NNT",
+        "reward 64.96 +- 1.13 %, score 25.55 +- 0.86 %",
+        58.5,
+    ),
+    AgentEntry(
+        "m5",
+        Lazy("baselines.ladder:m5"),
+        "m4 with block teacher forcing",
+        "Table 1, M5: M4 + BTF (fast)",
+        "reward 67.42 +- 0.55 %, score 27.91 +- 0.63 %",
+        58.5,
+    ),
+    AgentEntry(
+        "m5_slow",
+        Lazy("baselines.ladder:m5_slow"),
+        "m5 with eight times the world-model updates",
+        "Table 1, M5: M4 + BTF (slow)",
+        "reward 69.66 +- 1.20 %, score 31.77 +- 1.43 %",
+        58.5,
+    ),
+    AgentEntry(
+        "m5_patch5",
+        Lazy("baselines.ablations:m5_patch5"),
+        "m5 on patches of 5x5",
+        "Table 2, 5x5 quantized",
+        "reward 57.28 +- 1.14 %, score 18.26 +- 1.18 %",
+    ),
+    AgentEntry(
+        "m5_patch9",
+        Lazy("baselines.ablations:m5_patch9"),
+        "m5 on patches of 9x9",
+        "Table 2, 9x9 quantized",
+        "reward 45.55 +- 0.88 %, score 10.12 +- 0.40 %",
+    ),
+    AgentEntry(
+        "m5_continuous",
+        Lazy("baselines.ablations:m5_continuous"),
+        "m5 that regresses patches",
+        "Table 2, 7x7 continuous",
+        "reward 21.20 +- 0.55 %, score 2.43 +- 0.09 %",
+    ),
+    AgentEntry(
+        "m5_no_dyna",
+        Lazy("baselines.ablations:m5_no_dyna"),
+        "m5 that learns from imagination only",
+        "Table 2, Remove Dyna",
+        "reward 55.02 +- 5.34 %, score 18.79 +- 2.14 %",
+    ),
+    AgentEntry(
+        "m5_no_nnt",
+        Lazy("baselines.ablations:m5_no_nnt"),
+        "m5 with a VQ-VAE of patches",
+        "Table 2, Remove NNT",
+        "reward 60.66 +- 1.38 %, score 21.79 +- 1.33 %",
+    ),
+    AgentEntry(
+        "m5_no_nnt_no_patches",
+        Lazy("baselines.ablations:m5_no_nnt_no_patches"),
+        "m5 with a VQ-VAE of frames",
+        "Table 2, Remove NNT & patches",
+        "reward 45.86 +- 1.42 %, score 10.36 +- 0.69 %",
+    ),
+    AgentEntry(
+        "m5_no_btf",
+        Lazy("baselines.ablations:m5_no_btf"),
+        "the same as m4",
+        "Table 2, Remove BTF",
+        "reward 64.96 +- 1.13 %, score 25.55 +- 0.86 %",
+    ),
+    AgentEntry(
+        "m5_tbp0",
+        Lazy("baselines.ablations:m5_tbp0"),
+        "m5 that imagines from the start",
+        "Table 2, Use T_BP = 0",
+        "reward 33.54 +- 10.09 %, score 12.86 +- 4.05 %",
+    ),
+    AgentEntry(
+        "m5_annealed",
+        Lazy("baselines.ablations:m5_annealed"),
+        "m5 whose imagined updates grow linearly",
+        "Appendix C, annealing",
+        "reward 65.71 +- 1.11 %",
+    ),
+)
+
+PRESETS = (
+    PresetEntry("paper", "the paper's Appendix A; only these results are ranked (default on an accelerator)"),
+    PresetEntry("small", "scaled down so that two CPU cores learn something in minutes (default on a CPU)"),
+    PresetEntry("smoke", "two iterations within seconds, for tests; learns nothing"),
+)

@@ -1,0 +1,92 @@
+"""What the registry holds: tasks, agents and presets by where their parts are, without importing them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Lazy:
+    """Something at "module:name", imported when it is asked for; `arguments` are a function's first ones."""
+
+    reference: str
+    arguments: tuple[Any, ...] = ()
+
+    def __call__(self) -> Any:
+        """Imports it."""
+        module, name = self.reference.split(":")
+        found = getattr(importlib.import_module(module), name)
+        return functools.partial(found, *self.arguments) if self.arguments else found
+
+
+class Made(Lazy):
+    """What the function at "module:name" makes of the arguments, when it is asked for."""
+
+    def __call__(self) -> Any:
+        """Imports and calls it."""
+        return super().__call__()()
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskEntry:
+    """A task: where its parts are, without importing them.
+
+    Attributes:
+      id: `family` or `family/name`.
+      family: what its tasks share: rules, scoring, presets.
+      summary: one line.
+      spec: an `EnvironmentSpec`.
+      make: a function that builds the environment; its `progress: Callable[[str, float], None] | None` is told of
+        preparations that take long.
+      scores: a function of (episodes, configuration or None, specification) to numbers by name; None: all episodes
+        count alike, as in an evaluation.
+      presets: by name, functions `Config -> Config`; they see the agent's id in `config.agent`.
+      own_auto_reset: the batched environment, made from a number of environments, that resets as the package itself
+        does; for `suite bench` only. None: it has no auto-reset.
+      symbols: a function from an environment's state to what its frame shows, int32 [R], for `suite inspect`; None:
+        what it shows is not known.
+      symbol_values: how many values a symbol has.
+      cost: what a run takes, in words.
+    """
+
+    id: str
+    family: str
+    summary: str
+    spec: Lazy
+    make: Lazy
+    scores: Lazy
+    presets: Mapping[str, Lazy]
+    own_auto_reset: Lazy | None = None
+    symbols: Lazy | None = None
+    symbol_values: int = 0
+    cost: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class AgentEntry:
+    """An agent: a function `Config -> Config` that states what defines it.
+
+    Attributes:
+      row: where the paper reports it, "" if nowhere.
+      published: reward and score in percent as published for Craftax-classic at 1M steps, "" if there are none.
+      millions: of parameters, as published; None if they are not.
+    """
+
+    id: str
+    configure: Lazy
+    summary: str
+    row: str = ""
+    published: str = ""
+    millions: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class PresetEntry:
+    """A preset's name and purpose; what it changes belongs to each task (`TaskEntry.presets`)."""
+
+    id: str
+    summary: str
