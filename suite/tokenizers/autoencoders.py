@@ -18,12 +18,21 @@ from suite.convolution import convolve
 from suite.tokenizers.patches import join_patches, split_patches
 
 DOWNSAMPLED = (0, 2, 3)  # the first, third and fourth of five residual blocks
+SMALLEST_SIDE = (
+    5  # of the grid of latents: MinAtar's 10x10 are halved once, the paper's 63x63 thrice
+)
 MAX_GROUPS = 32
 
 
+def downsampled(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """After which residual blocks a frame (H, W, C) is halved: the first of `DOWNSAMPLED`, as many as it bears."""
+    sides = [math.ceil(min(shape[:2]) / 2**n) for n in range(1, len(DOWNSAMPLED) + 1)]
+    return DOWNSAMPLED[: sum(side >= SMALLEST_SIDE for side in sides)]
+
+
 def latent_grid(shape: tuple[int, ...]) -> tuple[int, int]:
-    """(rows, columns) of latents of a frame (H, W, C): halved, rounding up, once for each of `DOWNSAMPLED`."""
-    scale = 2 ** len(DOWNSAMPLED)
+    """(rows, columns) of latents of a frame (H, W, C): halved, rounding up, once for each of `downsampled`."""
+    scale = 2 ** len(downsampled(shape))
     return math.ceil(shape[0] / scale), math.ceil(shape[1] / scale)
 
 
@@ -96,15 +105,16 @@ class FrameEncoder(nnx.Module):
         self.first = Conv(shape[-1], channels[0], rngs)
         inputs = (channels[0], *channels[:-1])
         self.blocks = nnx.List(ResidualBlock(i, o, rngs) for i, o in zip(inputs, channels, strict=True))
-        self.downs = nnx.List(Down(channels[index], rngs) for index in DOWNSAMPLED)
+        self.halved = downsampled(shape)
+        self.downs = nnx.List(Down(channels[index], rngs) for index in self.halved)
         self.last = NormReLUConv(channels[-1], size, rngs)
 
     def __call__(self, x_NHWC: jax.Array) -> jax.Array:
         x_NHWC = self.first(x_NHWC)
         for index, block in enumerate(self.blocks):
             x_NHWC = block(x_NHWC)
-            if index in DOWNSAMPLED:
-                x_NHWC = self.downs[DOWNSAMPLED.index(index)](x_NHWC)
+            if index in self.halved:
+                x_NHWC = self.downs[self.halved.index(index)](x_NHWC)
         z_NHWD = self.last(x_NHWC)
         return z_NHWD.reshape(z_NHWD.shape[0], -1, z_NHWD.shape[-1])
 
@@ -117,14 +127,15 @@ class FrameDecoder(nnx.Module):
         self.first = Conv(size, channels[-1], rngs)
         outputs = (channels[0], *channels[:-1])
         self.blocks = nnx.List(ResidualBlock(i, o, rngs) for i, o in zip(channels, outputs, strict=True))
-        self.ups = nnx.List(Up(channels[index], rngs) for index in DOWNSAMPLED)
+        self.doubled = downsampled(shape)
+        self.ups = nnx.List(Up(channels[index], rngs) for index in self.doubled)
         self.last = NormReLUConv(channels[0], shape[-1], rngs)
 
     def __call__(self, z_NLD: jax.Array) -> jax.Array:
         x_NHWC = self.first(z_NLD.reshape(-1, *latent_grid(self.shape), z_NLD.shape[-1]))
         for index in reversed(range(len(self.blocks))):
-            if index in DOWNSAMPLED:
-                x_NHWC = self.ups[DOWNSAMPLED.index(index)](x_NHWC)
+            if index in self.doubled:
+                x_NHWC = self.ups[self.doubled.index(index)](x_NHWC)
             x_NHWC = self.blocks[index](x_NHWC)
         height, width, _ = self.shape
         return self.last(x_NHWC)[:, :height, :width]
