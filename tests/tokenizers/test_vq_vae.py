@@ -18,7 +18,7 @@ from suite.tokenizers.vq_vae import VQVAE, unit, vq_losses
 
 FRAME = ObservationSpec(shape=(15, 15, 3), high=255, kind="pixels", patch=(5, 5))
 CONFIG = TokenizerConfig(kind="patch_vq_vae", codebook_size=16, embed_dim=8, channels=(4, 4, 4, 4, 8))
-KINDS = {"vq_vae": (2, 2), "patch_vq_vae": (3, 3)}
+KINDS = {"vq_vae": (8, 8), "patch_vq_vae": (3, 3)}
 
 
 def config_of(kind: str, **changes) -> TokenizerConfig:
