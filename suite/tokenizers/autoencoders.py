@@ -18,9 +18,7 @@ from suite.convolution import convolve
 from suite.tokenizers.patches import join_patches, split_patches
 
 DOWNSAMPLED = (0, 2, 3)  # the first, third and fourth of five residual blocks
-SMALLEST_SIDE = (
-    5  # of the grid of latents: MinAtar's 10x10 are halved once, the paper's 63x63 thrice
-)
+SMALLEST_SIDE = 5  # of the grid of latents: MinAtar's 10x10 are halved once, the paper's 63x63 thrice
 MAX_GROUPS = 32
 
 
