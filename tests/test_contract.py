@@ -12,7 +12,6 @@ from suite.registry import tasks
 from tests.contract import check_environment
 from tests.tiny import Corridor, Pennies
 
-
 STEPS = {"minatar/freeway": 2_510}  # its episodes all last 2,500
 
 
