@@ -86,7 +86,7 @@ TASKS = (
         own_auto_reset=Lazy("adapters.craftax:BuiltInAutoReset"),
         symbols=Lazy("adapters.craftax_symbols:classic_symbols"),
         symbol_values=17,
-        cost="small on two CPU cores: m5 6 min, mfrl 2 min, random 15 s, 2.3 GiB; paper: an accelerator",
+        cost="small on one CPU core: m5 7 min, m3, m4 9, m1, m2 20, mfrl 2, random 1, 2.3 GiB; paper: an accelerator",
     ),
 )
 
