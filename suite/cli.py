@@ -14,7 +14,6 @@ import math
 import numbers
 import os
 import re
-import statistics
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -395,13 +394,10 @@ def _result_fields(seed: int, result: Result) -> dict[str, Any]:
 
 def _summary(results: Sequence[Result]) -> dict[str, tuple[float, float]]:
     """Mean and standard error of each score; nan where they say nothing."""
-    summary = {}
-    for name in (name for name in (results[0].scores if results else ()) if "/" not in name):
-        values = [float(result.scores[name]) for result in results]
-        known = len(values) > 1 and all(map(math.isfinite, values))
-        error = statistics.stdev(values) / math.sqrt(len(values)) if known else math.nan
-        summary[name] = (statistics.fmean(values), error)
-    return summary
+    from leaderboards.compare import spread
+
+    names = [name for name in (results[0].scores if results else ()) if "/" not in name]
+    return {name: spread(result.scores[name] for result in results) for name in names}
 
 
 def _print_scores(scores: Mapping[str, Any]) -> None:
