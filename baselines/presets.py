@@ -180,6 +180,8 @@ MINATAR_PAPER: dict[str, Any] = {
 
 MINATAR_SMALL: dict[str, Any] = {
     "protocol.steps": 102_400,  # 100 iterations of 16 x 64
+    # Freeway's games all last 2,500 steps: in 16 environments they end at 40,000 steps and at 80,000.
+    "protocol.final_fraction": 0.25,
     "environment.num_envs": 16,
     "environment.rollout_length": 64,
     "policy.cnn_channels": (16, 32),
