@@ -1,6 +1,6 @@
-"""Craftax-classic from pixels (Matthews et al. 2024) as a pure environment.
+"""Craftax-classic and Craftax (full) from pixels (Matthews et al. 2024) as pure environments.
 
-Importing this module loads no game and touches no device; `make_classic` does.
+Importing this module loads no game and touches no device; `make_classic` and `make_full` do.
 """
 
 from __future__ import annotations
@@ -14,42 +14,73 @@ import jax.numpy as jnp
 from adapters.numerics import like, loose_numerics, strong
 from suite.interface.environment import Environment, EnvironmentSpec, ObservationSpec, TimeStep
 
-CLASSIC_SPEC = EnvironmentSpec(
-    id="craftax_classic",
-    observation=ObservationSpec(shape=(63, 63, 3), high=255, kind="pixels", patch=(7, 7)),
-    num_actions=17,
-    reward_classes=(0.0, 1.0),
-    max_return=22.0,
-    achievements=(
-        "collect_wood",
-        "place_table",
-        "eat_cow",
-        "collect_sapling",
-        "collect_drink",
-        "make_wood_pickaxe",
-        "make_wood_sword",
-        "place_plant",
-        "defeat_zombie",
-        "collect_stone",
-        "place_stone",
-        "eat_plant",
-        "defeat_skeleton",
-        "make_stone_pickaxe",
-        "make_stone_sword",
-        "wake_up",
-        "place_furnace",
-        "collect_coal",
-        "collect_iron",
-        "collect_diamond",
-        "make_iron_pickaxe",
-        "make_iron_sword",
-    ),
-    statistics=(("achievements", (22,)), ("achievement_return", ()), ("health_return", ())),
-    package="craftax",
+CLASSIC_ACHIEVEMENTS = (
+    "collect_wood",
+    "place_table",
+    "eat_cow",
+    "collect_sapling",
+    "collect_drink",
+    "make_wood_pickaxe",
+    "make_wood_sword",
+    "place_plant",
+    "defeat_zombie",
+    "collect_stone",
+    "place_stone",
+    "eat_plant",
+    "defeat_skeleton",
+    "make_stone_pickaxe",
+    "make_stone_sword",
+    "wake_up",
+    "place_furnace",
+    "collect_coal",
+    "collect_iron",
+    "collect_diamond",
+    "make_iron_pickaxe",
+    "make_iron_sword",
+)
+# Those that the full game adds, in its order, by what they pay; the classic ones pay 1. Spelled as the game does.
+FURTHER_ACHIEVEMENTS = (
+    (1.0, ("make_arrow", "make_torch", "place_torch")),
+    (3.0, ("make_diamond_sword", "make_iron_armour", "make_diamond_armour", "enter_gnomish_mines", "enter_dungeon")),
+    (5.0, ("enter_sewers", "enter_vault", "enter_troll_mines")),
+    (8.0, ("enter_fire_realm", "enter_ice_realm", "enter_graveyard")),
+    (3.0, ("defeat_gnome_warrior", "defeat_gnome_archer", "defeat_orc_solider", "defeat_orc_mage")),
+    (5.0, ("defeat_lizard", "defeat_kobold", "defeat_troll", "defeat_deep_thing")),
+    (8.0, ("defeat_pigman", "defeat_fire_elemental", "defeat_frost_troll", "defeat_ice_elemental")),
+    (8.0, ("damage_necromancer", "defeat_necromancer")),
+    (3.0, ("eat_bat", "eat_snail", "find_bow", "fire_bow", "collect_sapphire")),
+    (5.0, ("learn_fireball", "cast_fireball", "learn_iceball", "cast_iceball")),
+    (3.0, ("collect_ruby", "make_diamond_pickaxe", "open_chest", "drink_potion")),
+    (5.0, ("enchant_sword", "enchant_armour", "defeat_knight", "defeat_archer")),
+)
+
+
+def _spec(id: str, pixels: tuple[int, int, int], tile: int, actions: int, rewards: dict[str, float]) -> EnvironmentSpec:
+    return EnvironmentSpec(
+        id=id,
+        observation=ObservationSpec(shape=pixels, high=255, kind="pixels", patch=(tile, tile)),
+        num_actions=actions,
+        reward_classes=(0.0, *sorted(set(rewards.values()))),
+        achievements=tuple(rewards),
+        achievement_rewards=tuple(rewards.values()),
+        statistics=(("achievements", (len(rewards),)), ("achievement_return", ()), ("health_return", ())),
+        package="craftax",
+    )
+
+
+_CLASSIC = dict.fromkeys(CLASSIC_ACHIEVEMENTS, 1.0)
+CLASSIC_SPEC = _spec("craftax_classic", (63, 63, 3), 7, 17, _CLASSIC)
+FULL_SPEC = _spec(
+    "craftax_full",
+    (130, 110, 3),
+    10,
+    43,
+    _CLASSIC | {name: reward for reward, names in FURTHER_ACHIEVEMENTS for name in names},
 )
 
 START_HEALTH = 9
 HEALTH_REWARD = 0.1  # per point of health gained or lost
+NO_LIMIT = 2**31 - 1
 
 
 def make_classic(progress: Callable[[str, float], None] | None = None) -> Environment:
@@ -65,26 +96,51 @@ def make_classic(progress: Callable[[str, float], None] | None = None) -> Enviro
     return environment
 
 
-class CraftaxClassic:
-    """One game of Craftax-classic; see `suite.interface.environment.Environment`.
+def make_full(progress: Callable[[str, float], None] | None = None) -> Environment:
+    """Craftax (full), ready to be compiled.
 
-    Observations are uint8 [63, 63, 3]: craftax's frames before it divides them by 255, rounded (fidelity note 14). The
-    reward is the game's own. An episode ends by death (terminated) or, alive, after `max_timesteps` (truncated).
+    Args:
+      progress: called with a message and the fraction done; loading the game takes a few seconds.
+    """
+    report = progress or (lambda message, fraction: None)
+    report("Loading Craftax", 0.0)
+    environment = CraftaxFull()
+    report("Loading Craftax", 1.0)
+    return environment
+
+
+class Craftax:
+    """What both games have in common; see `suite.interface.environment.Environment`.
+
+    Observations are uint8: craftax's frames before it divides them by 255, rounded (fidelity note 14). The reward is
+    the game's own. An episode ends by death or, in the full game, by victory (terminated), or else after
+    `max_timesteps` (truncated).
 
     The state is craftax's `EnvState`. The statistics need none of their own: an achievement is never lost, and what
     health adds to the return telescopes to 0.1 x (health - 9) (fidelity note 29).
+
+    Args:
+      spec: what the game is.
+      parameters, sizes: craftax's `EnvParams` and `StaticEnvParams`.
+      step: craftax's `craftax_step`.
+      is_over: craftax's `is_game_over`, of a state and `EnvParams`.
+      generate_world: craftax's.
+      render: from a state to its frame, float32 in [0, 255].
     """
 
-    spec = CLASSIC_SPEC
-
-    def __init__(self, max_timesteps: int = 10_000):
-        from craftax.craftax_classic import game_logic, world_gen
-        from craftax.craftax_classic.envs.craftax_state import EnvParams, StaticEnvParams
-
-        from adapters.craftax_renderer import make_renderer
-
-        self._params, self._sizes = EnvParams(max_timesteps=max_timesteps), StaticEnvParams()
-        self._game, self._generate_world, self._render = game_logic, world_gen.generate_world, make_renderer()
+    def __init__(
+        self,
+        spec: EnvironmentSpec,
+        parameters: Any,
+        sizes: Any,
+        step: Callable[..., Any],
+        is_over: Callable[[Any, Any], Any],
+        generate_world: Callable[..., Any],
+        render: Callable[[Any], jax.Array],
+    ):
+        self.spec = spec
+        self._params, self._sizes, self._unlimited = parameters, sizes, parameters.replace(max_timesteps=NO_LIMIT)
+        self._step, self._is_over, self._generate_world, self._render = step, is_over, generate_world, render
 
     def reset(self, key: jax.Array) -> tuple[Any, TimeStep]:
         """A freshly generated world."""
@@ -97,11 +153,11 @@ class CraftaxClassic:
     def step(self, key: jax.Array, state: Any, action: jax.Array) -> tuple[Any, TimeStep]:
         """One step of the game."""
         with loose_numerics():
-            stepped, reward = self._game.craftax_step(key, state, action, self._params, self._sizes)
-            over = self._game.is_game_over(stepped, self._params)
+            stepped, reward = self._step(key, state, action, self._params, self._sizes)
+            terminated = strong(self._is_over(stepped, self._unlimited))
         stepped = like(stepped, state)
-        truncated = (stepped.timestep >= self._params.max_timesteps) & (stepped.player_health > 0)
-        flags = {"terminated": over & ~truncated, "truncated": truncated, "first": jnp.zeros((), bool)}
+        truncated = (stepped.timestep >= self._params.max_timesteps) & ~terminated
+        flags = {"terminated": terminated, "truncated": truncated, "first": jnp.zeros((), bool)}
         return stepped, self._time_step(stepped, strong(reward, jnp.dtype(jnp.float32)), **flags)
 
     def _time_step(self, state: Any, reward: jax.Array, **flags: Any) -> TimeStep:
@@ -110,32 +166,75 @@ class CraftaxClassic:
             observation=observation,
             final_observation=observation,
             reward=reward,
-            statistics=_statistics(state),
+            statistics=_statistics(state, self.spec),
             **flags,
         )
 
 
-class BuiltInAutoReset:
-    """Craftax-classic with the package's own auto-reset and our renderer: what `suite bench` measures ours against.
-
-    A `BatchedEnvironment` that generates a world for every environment at every step. As in the package, an end is
-    not told from a time limit (always `terminated`), and an episode's last frame and statistics are lost.
-    """
+class CraftaxClassic(Craftax):
+    """One game of Craftax-classic: 63x63 pixels, 22 achievements that pay 1 each."""
 
     spec = CLASSIC_SPEC
 
-    def __init__(self, num_envs: int):
-        from craftax.craftax_classic.envs.craftax_pixels_env import CraftaxClassicPixelsEnv
+    def __init__(self, max_timesteps: int = 10_000):
+        from craftax.craftax_classic import game_logic, world_gen
+        from craftax.craftax_classic.envs.craftax_state import EnvParams, StaticEnvParams
 
-        from adapters.craftax_renderer import make_renderer
+        from adapters.craftax_classic_renderer import make_renderer
 
-        class Game(CraftaxClassicPixelsEnv):
-            def __init__(self):  # not the package's own, which prepares textures for half a minute
-                self.static_env_params = self.default_static_params()
-                self._render_fn = make_renderer()
+        super().__init__(
+            CLASSIC_SPEC,
+            EnvParams(max_timesteps=max_timesteps),
+            StaticEnvParams(),
+            game_logic.craftax_step,
+            game_logic.is_game_over,
+            world_gen.generate_world,
+            make_renderer(),
+        )
 
-        self.num_envs = num_envs
-        self._game = Game()
+
+class CraftaxFull(Craftax):
+    """One game of Craftax (full): 130x110 pixels, nine levels, 67 achievements worth 226."""
+
+    spec = FULL_SPEC
+
+    def __init__(self, max_timesteps: int = 100_000):
+        from craftax.craftax import game_logic
+        from craftax.craftax.craftax_state import EnvParams, StaticEnvParams
+        from craftax.craftax.world_gen.world_gen import generate_world
+
+        from adapters.craftax_full_renderer import make_renderer
+
+        sizes = StaticEnvParams()
+        super().__init__(
+            FULL_SPEC,
+            EnvParams(max_timesteps=max_timesteps),
+            sizes,
+            game_logic.craftax_step,
+            lambda state, parameters: game_logic.is_game_over(state, parameters, sizes),
+            generate_world,
+            make_renderer(),
+        )
+
+
+class BuiltInAutoReset:
+    """A game with the package's own auto-reset and our renderer: what `suite bench` measures ours against.
+
+    A `BatchedEnvironment` that generates a world for every environment at every step. As in the package, an end is
+    not told from a time limit (always `terminated`), and an episode's last frame and statistics are lost.
+
+    Args:
+      game: craftax's pixel environment that resets by itself, a class.
+      spec: the game's.
+      render: as of `Craftax`.
+      num_envs: B.
+    """
+
+    def __init__(self, game: Any, spec: EnvironmentSpec, render: Callable[[Any], jax.Array], num_envs: int):
+        self.spec, self.num_envs = spec, num_envs
+        self._game = game.__new__(game)  # without its __init__, which prepares textures for minutes
+        self._game.static_env_params = game.default_static_params()
+        self._game._render_fn = render
 
     def reset(self, key: jax.Array) -> tuple[Any, TimeStep]:
         """First time steps of B episodes; every array leads with B."""
@@ -162,13 +261,32 @@ class BuiltInAutoReset:
             truncated=jnp.zeros(self.num_envs, bool),
             first=first_B,
             final_observation=observation_B,
-            statistics=jax.vmap(_statistics)(state),
+            statistics=jax.vmap(lambda state: _statistics(state, self.spec))(state),
         )
 
 
-def _statistics(state: Any) -> dict[str, jax.Array]:
+def classic_built_in_auto_reset(num_envs: int) -> BuiltInAutoReset:
+    """B games of Craftax-classic that reset as the package does."""
+    from craftax.craftax_classic.envs.craftax_pixels_env import CraftaxClassicPixelsEnv
+
+    from adapters.craftax_classic_renderer import make_renderer
+
+    return BuiltInAutoReset(CraftaxClassicPixelsEnv, CLASSIC_SPEC, make_renderer(), num_envs)
+
+
+def full_built_in_auto_reset(num_envs: int) -> BuiltInAutoReset:
+    """B games of Craftax (full) that reset as the package does."""
+    from craftax.craftax.envs.craftax_pixels_env import CraftaxPixelsEnv
+
+    from adapters.craftax_full_renderer import make_renderer
+
+    return BuiltInAutoReset(CraftaxPixelsEnv, FULL_SPEC, make_renderer(), num_envs)
+
+
+def _statistics(state: Any, spec: EnvironmentSpec) -> dict[str, jax.Array]:
+    rewards = jnp.asarray(spec.achievement_rewards, jnp.float32)
     return {
         "achievements": state.achievements,
-        "achievement_return": state.achievements.sum(dtype=jnp.float32),
+        "achievement_return": state.achievements.astype(jnp.float32) @ rewards,
         "health_return": HEALTH_REWARD * (state.player_health - START_HEALTH).astype(jnp.float32),
     }

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from adapters.craftax_renderer import (
+from adapters.craftax_classic_renderer import (
     CENTER,
     COLUMNS,
     ITEMS,

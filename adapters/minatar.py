@@ -2,7 +2,8 @@
 
 Against the original package (fidelity note 31): actions never stick (there 0.1), only those that do something in the
 game can be chosen, and episodes are cut after 1,000 steps, Freeway's after 2,500 (there it ends, one step later; the
-other games have no limit). Where the randomness is the same, observations, rewards and ends are the original's.
+other games have no limit). Where the randomness is the same, observations, rewards and ends are the original's, but
+for the oxygen in the frame with which surfacing ends Seaquest: here it is full.
 """
 
 from __future__ import annotations
@@ -23,23 +24,35 @@ SIDE, PATCH = 10, 2
 
 @dataclasses.dataclass(frozen=True)
 class Game:
-    """Attributes: `reference`, gymnax's class at "module:name"; `objects`, planes of its observation; `actions`."""
+    """One of MinAtar's.
+
+    Attributes:
+      reference: gymnax's class at "module:name".
+      objects: planes of its observation.
+      actions: those that do something.
+      rewards: all that a step can pay, ascending.
+    """
 
     reference: str
     objects: int
     actions: tuple[str, ...]
+    rewards: tuple[float, ...] = (0.0, 1.0)
 
 
 GAMES = {
     "asterix": Game("asterix:MinAsterix", 4, ("none", "left", "up", "right", "down")),
     "breakout": Game("breakout:MinBreakout", 4, ("none", "left", "right")),
     "freeway": Game("freeway:MinFreeway", 7, ("none", "up", "down")),
+    # Not one of the paper's games. Surfacing with six divers pays up to 10; a shot may hit in the same step.
+    "seaquest": Game(
+        "seaquest:MinSeaquest", 10, ("none", "left", "up", "right", "down", "fire"), tuple(map(float, range(12)))
+    ),
     "space_invaders": Game("space_invaders:MinSpaceInvaders", 6, ("none", "left", "right", "fire")),
 }
 
 
 def spec(name: str) -> EnvironmentSpec:
-    """What the game of this name is. Rewards are 0 or 1."""
+    """What the game of this name is."""
     if name not in GAMES:
         raise UserError(f"unknown task 'minatar/{name}'; {did_you_mean(name, GAMES)}")
     game = GAMES[name]
@@ -47,7 +60,7 @@ def spec(name: str) -> EnvironmentSpec:
         id=f"minatar/{name}",
         observation=ObservationSpec(shape=(SIDE, SIDE, game.objects), high=1, kind="grid", patch=(PATCH, PATCH)),
         num_actions=len(game.actions),
-        reward_classes=(0.0, 1.0),
+        reward_classes=game.rewards,
         package="gymnax",
     )
 

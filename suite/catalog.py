@@ -70,6 +70,7 @@ TASKS = (
     _minatar("asterix", "MinAtar's Asterix: gold and enemies; 10x10x4, 5 actions"),
     _minatar("breakout", "MinAtar's Breakout; 10x10x4, 3 actions"),
     _minatar("freeway", "MinAtar's Freeway: cross between cars; 10x10x7, 3 actions"),
+    _minatar("seaquest", "MinAtar's Seaquest, not among the paper's; 10x10x10, 6 actions"),
     _minatar("space_invaders", "MinAtar's Space Invaders; 10x10x6, 4 actions"),
     TaskEntry(
         id="craftax_classic",
@@ -83,10 +84,25 @@ TASKS = (
             "small": Lazy("baselines.presets:craftax_classic_small"),
             "smoke": Lazy("baselines.presets:craftax_classic_smoke"),
         },
-        own_auto_reset=Lazy("adapters.craftax:BuiltInAutoReset"),
+        own_auto_reset=Lazy("adapters.craftax:classic_built_in_auto_reset"),
         symbols=Lazy("adapters.craftax_symbols:classic_symbols"),
         symbol_values=17,
         cost="small on one CPU core: m5 7 min, m3, m4 9, m1, m2 20, mfrl 2, random 1, 2.3 GiB; paper: an accelerator",
+    ),
+    TaskEntry(
+        id="craftax_full",
+        family="craftax_full",
+        summary="Craftax (full) from 130x110 pixels: 43 actions, 67 achievements worth 226",
+        spec=Lazy("adapters.craftax:FULL_SPEC"),
+        make=Lazy("adapters.craftax:make_full"),
+        scores=Lazy("leaderboards.scoring:craftax"),
+        presets={
+            "paper": Lazy("baselines.presets:craftax_full_paper"),
+            "small": Lazy("baselines.presets:craftax_full_small"),
+            "smoke": Lazy("baselines.presets:craftax_full_smoke"),
+        },
+        own_auto_reset=Lazy("adapters.craftax:full_built_in_auto_reset"),
+        paper_agent="m5_slow",
     ),
 )
 

@@ -119,7 +119,9 @@ def _parsers() -> tuple[_Parser, dict[str, _Parser]]:
 
 def _add_configuration(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("task", metavar="TASK", help="see `suite list tasks`")
-    parser.add_argument("--agent", default="m5", metavar="A", help="see `suite list agents` (default m5)")
+    parser.add_argument(
+        "--agent", metavar="A", help="see `suite list agents` (default m5; craftax_full paper: m5_slow)"
+    )
     parser.add_argument("--preset", metavar="P", help="see `suite list presets` (default: fit for this machine)")
     parser.add_argument("--steps", type=int, metavar="N", help="real environment steps (default: the preset's)")
     parser.add_argument(
@@ -238,7 +240,7 @@ def _describe(args: argparse.Namespace) -> int:
     counted = [f"{name.replace('_', ' ')} {description.parameters(name):,}" for name in networks]
     counted.append(f"2 x codebook {description.parameters('codebook'):,} (stored twice in the paper's bookkeeping)")
     print(f"\nTotal: {description.total:,}{' = ' + ' + '.join(counted) if 'codebook' in description.modules else ''}")
-    if published := _published(registry.agent(args.agent)):
+    if published := _published(registry.agent(layers[-1][1].agent)):
         print(f"Published for craftax_classic: {published}")
     print("\nDerived")
     _print_table([name, f"{value:,}", how] for name, value, how in description.derived)

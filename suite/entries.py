@@ -8,6 +8,8 @@ import importlib
 from collections.abc import Mapping
 from typing import Any
 
+DEFAULT_AGENT = "m5"
+
 
 @dataclasses.dataclass(frozen=True)
 class Lazy:
@@ -51,6 +53,7 @@ class TaskEntry:
         what it shows is not known.
       symbol_values: how many values a symbol has.
       cost: what a run takes, in words.
+      paper_agent: the agent that runs under `paper` unless another is named: what the paper's table of the task is of.
     """
 
     id: str
@@ -64,6 +67,7 @@ class TaskEntry:
     symbols: Lazy | None = None
     symbol_values: int = 0
     cost: str = ""
+    paper_agent: str = DEFAULT_AGENT
 
 
 @dataclasses.dataclass(frozen=True)

@@ -118,7 +118,7 @@ def cache_race(agent: Agent) -> Table:
     """The last imagined step of a context of 20 frames, with the key-value cache and by recomputing all frames."""
     config, tokens = agent.config, agent.tokens
     batch, length = config.imagination.num_envs, RACE_FRAMES
-    model: WorldModel = nnx.merge(agent.world_model_graph, agent.init(jax.random.key(0)).world_model.params)
+    model = WorldModel(config.world_model, tokens, agent.grid, nnx.Rngs(0))
     graph, params = nnx.split(model)
     frames = _random_tokens(tokens, (batch, length))
     actions = jax.random.randint(jax.random.key(2), (batch, length), 0, tokens.num_actions)

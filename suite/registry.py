@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 
 from suite.catalog import AGENTS, FAMILIES, PRESETS, TASKS
 from suite.config import Config
-from suite.entries import AgentEntry, Lazy, Made, PresetEntry, TaskEntry
+from suite.entries import DEFAULT_AGENT, AgentEntry, Lazy, Made, PresetEntry, TaskEntry
 from suite.errors import UserError, did_you_mean
 from suite.overrides import apply_changes, parse_overrides
 
@@ -58,7 +58,7 @@ def agent(id: str) -> AgentEntry:
 
 def resolve(
     task: str,
-    agent: str = "m5",
+    agent: str | None = None,
     preset: str | None = None,
     overrides: Sequence[str] = (),
     seed: int = 0,
@@ -68,7 +68,7 @@ def resolve(
 
     Args:
       task: a task's id.
-      agent: an agent's id.
+      agent: an agent's id; None: "m5", and under "paper" the one that the paper's table of this task reports.
       preset: a preset's name; None: "paper" where there is an accelerator, else "small"; the task's first if it lacks
         that one.
       overrides: the user's "dotted.name=value", the last word on every field.
@@ -83,14 +83,15 @@ def resolve(
 
 def layers(
     task: str,
-    agent: str = "m5",
+    agent: str | None = None,
     preset: str | None = None,
     overrides: Sequence[str] = (),
     seed: int = 0,
     steps: int | None = None,
 ) -> list[tuple[Source, Config]]:
     """As `resolve`, with the configuration after each source's changes; the last is the run's."""
-    task_entry, agent_entry = _find_task(task), _find("agent", agent, agents())
+    task_entry = _find_task(task)
+    agent_entry = None if agent is None else _find("agent", agent, agents())
     changes = parse_overrides(overrides)
     if steps is not None:
         changes["protocol.steps"] = steps
@@ -99,7 +100,9 @@ def layers(
     if preset is None:
         preset = "paper" if _on_accelerator() else "small"
         preset = preset if preset in task_entry.presets else next(iter(task_entry.presets))
-    start = apply_changes(Config(task=task, agent=agent, preset=preset), {"seed": seed})
+    if agent_entry is None:
+        agent_entry = _find("agent", task_entry.paper_agent if preset == "paper" else DEFAULT_AGENT, agents())
+    start = apply_changes(Config(task=task, agent=agent_entry.id, preset=preset), {"seed": seed})
     configs: list[tuple[Source, Config]] = [("default", _with_compute_type(start))]
     transforms: tuple[tuple[Source, Transform], ...] = (
         ("preset", task_entry.presets[preset]()),

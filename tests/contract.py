@@ -17,14 +17,15 @@ from suite.interface.environment import Environment, TimeStep
 from suite.interface.turns import choose_event
 
 PATTERNS = {"pixels": 3, "grid": 3, "symbols": 1}  # axes of an observation
+REWARDS = 10_000
 
 
 @dataclasses.dataclass
 class Play:
     """T random events in B environments: `states` and `shown` are [T + 1, B], the rest [T, B].
 
-    `stepped` is what stepping alone gives and `fresh_*` what resetting alone gives, with the keys that `Batched`
-    documents; `shown[t + 1]` and `states[t + 1]` are what `Batched` made of them.
+    `stepped` is what stepping alone gives and `fresh_*`, where an episode ended, what resetting alone gives, with the
+    keys that `Batched` documents; `shown[t + 1]` and `states[t + 1]` are what `Batched` made of them.
     """
 
     states: Any
@@ -51,7 +52,8 @@ def check_environment(
     Args:
       environment: what to check.
       key: of the random play.
-      steps: T, how many events to play in each of the environments.
+      steps: T, how many events to play in each of the environments; then play goes on, and only rewards are checked,
+        until it is `REWARDS` events.
       num_envs: B.
       prepare: changes the B first states, so that rare events happen; returns them in the same types.
 
@@ -60,9 +62,11 @@ def check_environment(
     """
     check_spec(environment)
     check_types(environment, num_envs)
-    play = _play(environment, key, steps, num_envs, prepare)
+    play, further = _play(environment, key, steps, num_envs, prepare)
     check_ranges(environment, play)
-    check_rewards(environment, play)
+    # What a prepared state has gained before is not in the statistics that were shown with it.
+    for shown in (jax.tree.map(lambda array: array[1:], play.shown), *further):
+        check_rewards(environment, shown)
     check_auto_reset(play)
     return play
 
@@ -74,6 +78,9 @@ def check_spec(environment: Environment) -> None:
     assert 1 <= observation.high <= 255
     assert spec.num_actions >= 2
     assert list(spec.reward_classes) == sorted(set(spec.reward_classes)) and 0.0 in spec.reward_classes
+    assert len(spec.achievements) == len(spec.achievement_rewards) and set(spec.achievement_rewards) <= set(
+        spec.reward_classes
+    )
     assert (observation.patch is None) == (observation.kind == "symbols")
     if observation.patch is not None:
         assert all(side % patch == 0 for side, patch in zip(observation.shape, observation.patch, strict=False))
@@ -120,7 +127,7 @@ def check_ranges(environment: Environment, play: Play) -> None:
     assert np.isfinite(play.stepped.reward).all()
     assert not (play.stepped.terminated & play.stepped.truncated).any()
     assert not play.stepped.first.any(), "a step alone never begins an episode"
-    assert play.fresh.first.all() and not play.fresh.reward.any()
+    assert play.fresh.first[play.ended].all() and not play.fresh.reward.any()
     assert not (play.fresh.terminated | play.fresh.truncated).any()
     _equal(play.stepped.observation, play.stepped.final_observation)
     turn = play.shown.turn
@@ -135,23 +142,25 @@ def check_ranges(environment: Environment, play: Play) -> None:
         )
 
 
-def check_rewards(environment: Environment, play: Play) -> None:
-    """Each reward is within half a class of a level, apart from what health adds where statistics count health."""
-    reward = play.stepped.reward
-    statistics = play.stepped.statistics
+def check_rewards(environment: Environment, shown: TimeStep) -> None:
+    """Each reward is within half a class of a level, apart from what health adds where statistics count health.
+
+    `shown`: T + 1 time steps of play that goes on from one to the next, [T + 1, B].
+    """
+    spec, statistics, reward = environment.spec, shown.statistics, shown.reward[1:]
     if "health_return" in statistics:
-        # What a reset shows is the sum so far of a new episode.
-        before = jax.tree.map(
-            lambda shown, fresh: np.concatenate([shown[:1], np.where(_wide(play.ended, fresh), fresh, shown[1:])[:-1]]),
-            play.shown.statistics,
-            play.fresh.statistics,
+        ended = (shown.terminated | shown.truncated)[:-1]
+
+        def gained(name: str) -> np.ndarray:
+            """What a step added to a sum, which is zero where an episode begins."""
+            return statistics[name][1:] - np.where(ended, 0, statistics[name][:-1])
+
+        np.testing.assert_allclose(reward, gained("achievement_return") + gained("health_return"), atol=1e-5)
+        np.testing.assert_allclose(
+            statistics["achievements"] @ np.array(spec.achievement_rewards), statistics["achievement_return"]
         )
-        health = statistics["health_return"] - before["health_return"]
-        achieved = statistics["achievement_return"] - before["achievement_return"]
-        np.testing.assert_allclose(reward, achieved + health, atol=1e-5)
-        np.testing.assert_array_equal(statistics["achievements"].sum(-1), statistics["achievement_return"])
-        reward = reward - health
-    levels = np.array(environment.spec.reward_classes, np.float32)
+        reward = reward - gained("health_return")
+    levels = np.array(spec.reward_classes, np.float32)
     distance = np.abs(reward[..., None] - levels)
     gaps = np.diff(levels)
     half = np.minimum(np.append(gaps, math.inf), np.insert(gaps, 0, math.inf)) / 2
@@ -173,7 +182,7 @@ def check_auto_reset(play: Play) -> None:
 
 @functools.cache
 def _programs(environment: Environment, num_envs: int, steps: int):
-    """Compiled once for each environment object: reset, T batched events, and the same done by hand."""
+    """Compiled once for each environment object: reset and T events of a batch, T steps by hand, a reset by hand."""
     batched = Batched(environment, num_envs)
 
     def event(carry, key):
@@ -190,20 +199,19 @@ def _programs(environment: Environment, num_envs: int, steps: int):
 
     def by_hand(_, before):
         state, key, action_B = before
-        step_keys_B, reset_keys_B = jax.random.split(key, (2, num_envs))
-        stepped = jax.vmap(environment.step)(step_keys_B, state, action_B)
-        seats_B = (1 + jnp.arange(num_envs) % 2,) if environment.spec.two_player else ()
-        return None, (*stepped, *jax.vmap(environment.reset)(reset_keys_B, *seats_B))
+        return None, jax.vmap(environment.step)(jax.random.split(key, (2, num_envs))[0], state, action_B)
 
     return (
         jax.jit(batched.reset),
         jax.jit(lambda carry, key: jax.lax.scan(event, carry, jax.random.split(key, steps))),
         jax.jit(lambda states, keys, actions: jax.lax.scan(by_hand, None, (states, keys, actions))[1]),
+        jax.jit(environment.reset),
     )
 
 
-def _play(environment, key, steps, num_envs, prepare) -> Play:
-    reset, events, by_hand = _programs(environment, num_envs, steps)
+def _play(environment, key, steps, num_envs, prepare) -> tuple[Play, list[TimeStep]]:
+    """The play, and what went on from there."""
+    reset, events, by_hand, reset_one = _programs(environment, num_envs, steps)
     reset_key, events_key = jax.random.split(key)
     state, shown = reset(reset_key)
     _equal(shown, reset(reset_key)[1])
@@ -211,11 +219,27 @@ def _play(environment, key, steps, num_envs, prepare) -> Play:
     start = prepare(state), shown
     carry, (after, keys, actions) = events(start, events_key)
     _equal(after, events(start, events_key)[1][0])  # the same key, state and actions give the same
-    events(carry, events_key)  # fed its own output
+    further = []
+    for played in range(steps, max(REWARDS // num_envs, 2 * steps), steps):
+        last, (carry, (later, _, _)) = carry[1], events(carry, jax.random.fold_in(events_key, played))
+        further.append(_following(last, later[1]))
     assert events._cache_size() == 1, "a step's output makes a step compile again"
-    states, shown = jax.tree.map(lambda one, many: jnp.concatenate([one[None], many]), start, after)
-    stepped_states, stepped, fresh_states, fresh = by_hand(jax.tree.map(lambda a: a[:-1], states), keys, actions)
-    return Play(*(jax.tree.map(_numpy, part) for part in (states, shown, stepped_states, stepped, fresh_states, fresh)))
+    states = jax.tree.map(lambda one, many: jnp.concatenate([one[None], many]), start[0], after[0])
+    shown = _following(start[1], after[1])
+    before, states, shown = jax.tree.map(lambda a: a[:-1], states), *jax.tree.map(_numpy, (states, shown))
+    stepped_states, stepped = jax.tree.map(_numpy, by_hand(before, keys, actions))
+    fresh_states, fresh = jax.tree.map(np.zeros_like, (stepped_states, stepped))
+    reset_keys_TB = jax.vmap(lambda key: jax.random.split(key, (2, num_envs))[1])(keys)
+    for t, b in zip(*np.nonzero(stepped.terminated | stepped.truncated), strict=True):
+        seat = (jnp.int32(1 + b % 2),) if environment.spec.two_player else ()
+        one = reset_one(reset_keys_TB[t, b], *seat)
+        for whole, part in zip(*map(jax.tree.leaves, ((fresh_states, fresh), one)), strict=True):
+            whole[t, b] = _numpy(part)
+    return Play(states, shown, stepped_states, stepped, fresh_states, fresh), further
+
+
+def _following(first: TimeStep, later: TimeStep) -> TimeStep:
+    return jax.tree.map(lambda one, many: _numpy(jnp.concatenate([one[None], many])), first, later)
 
 
 def _numpy(array: jax.Array) -> np.ndarray:

@@ -169,3 +169,17 @@ def test_presets_of_the_games():
     assert (config.ppo.discount, config.ppo.gae_lambda, config.ppo.target_decay) == (0.925, 0.625, 0.95)
     assert config.policy.rnn_size == 256
     assert registry.resolve("openspiel/tic_tac_toe", "m5", "paper").policy.rnn_size == 0
+
+
+@pytest.mark.parametrize(
+    ("task", "preset", "agent"),
+    [
+        ("craftax_full", "paper", "m5_slow"),  # its table reports the slow one
+        ("craftax_full", "small", "m5"),
+        ("craftax_classic", "paper", "m5"),
+        ("minatar/breakout", "paper", "m5"),
+    ],
+)
+def test_the_agent_that_runs_unless_another_is_named(task, preset, agent):
+    assert registry.resolve(task, preset=preset).agent == agent
+    assert registry.resolve(task, "mfrl", preset).agent == "mfrl"

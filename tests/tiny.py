@@ -19,8 +19,8 @@ CORRIDOR_SPEC = EnvironmentSpec(
     observation=ObservationSpec(shape=(4, 4, 1), high=255, kind="pixels", patch=(2, 2)),
     num_actions=2,
     reward_classes=(0.0, 1.0),
-    max_return=1.0,
     achievements=("arrive",),
+    achievement_rewards=(1.0,),
     statistics=(("achievements", (1,)), ("achievement_return", ()), ("health_return", ())),
     package="numpy",
 )

@@ -109,33 +109,33 @@ class Agent:
     def _policy(self, learner: ppo.Learner) -> Any:
         return nnx.merge(self.policy_graph, learner.params)
 
-    @functools.partial(jax.jit, static_argnums=0)
     def init(self, key: jax.Array) -> TrainState:
-        """A fresh agent in fresh environments."""
+        """A fresh agent in fresh environments: two programs, since `start` is worth compiling only once."""
         policy_key, player_key, tokenizer_key, model_key = jax.random.split(key, 4)
-        policy = self._new_policy(nnx.Rngs(policy_key))
-        params = nnx.state(policy)
+        untrained = self._untrained(policy_key, tokenizer_key, model_key)
+        return TrainState(player=self.start(untrained["learner"].acting, player_key), **untrained)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _untrained(self, policy_key: jax.Array, tokenizer_key: jax.Array, model_key: jax.Array) -> dict[str, Any]:
+        """What a fresh `TrainState` holds besides its player."""
+        params = nnx.state(self._new_policy(nnx.Rngs(policy_key)))
         learner = ppo.Learner.create(self.config.ppo, self.policy_optimizer, params)
-        state = TrainState(learner=learner, player=self._start(policy, player_key))
         if not self.config.world_model.enabled:
-            return state
+            return {"learner": learner}
         model_params = nnx.state(self._new_world_model(nnx.Rngs(model_key)))
-        return dataclasses.replace(
-            state,
-            replay=self.replay.init(self.spec),
-            tokenizer=self.tokenizer.init(tokenizer_key),
-            world_model=world_model_training.WorldModelLearner(
+        return {
+            "learner": learner,
+            "replay": self.replay.init(self.spec),
+            "tokenizer": self.tokenizer.init(tokenizer_key),
+            "world_model": world_model_training.WorldModelLearner(
                 params=model_params, optimizer=self.world_model_optimizer.init(model_params)
             ),
-        )
-
-    def _start(self, policy: Any, key: jax.Array) -> play.Player:
-        return play.start(policy, self.batched, key, self.config.environment.burn_in)
+        }
 
     @functools.partial(jax.jit, static_argnums=0)
     def start(self, learner: ppo.Learner, key: jax.Array) -> play.Player:
-        """A player in fresh environments, for evaluation."""
-        return self._start(self._policy(learner), key)
+        """A player in fresh environments; it remembers nothing."""
+        return play.start(self._policy(learner), self.batched, key, self.config.environment.burn_in)
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=2)
     def collect(

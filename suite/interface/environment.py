@@ -47,8 +47,8 @@ class EnvironmentSpec:
       num_actions: A, the number of actions of our player.
       reward_classes: ascending reward levels that a world model tells apart (Appendix A.2.2); a real reward
         belongs to the nearest level, ties to the higher one. With (0, 1): class 1 iff r >= 0.5.
-      max_return: the sum of all achievements' rewards where there is such a bound (22 for Craftax-classic).
       achievements: names of the achievements, in the order of `TimeStep.statistics["achievements"]`.
+      achievement_rewards: what each pays, once an episode.
       statistics: names and shapes of the per-episode statistics that time steps carry.
       package: the package whose rules these are; its version is part of the protocol.
       two_player: whether time steps carry a `Turn`, and `reset` takes our seat.
@@ -59,12 +59,17 @@ class EnvironmentSpec:
     observation: ObservationSpec
     num_actions: int
     reward_classes: tuple[float, ...]
-    max_return: float | None = None
     achievements: tuple[str, ...] = ()
+    achievement_rewards: tuple[float, ...] = ()
     statistics: tuple[tuple[str, tuple[int, ...]], ...] = ()
     package: str = ""
     two_player: bool = False
     chance_outcomes: int = 0
+
+    @property
+    def max_return(self) -> float | None:
+        """The sum of all achievements' rewards (22 for Craftax-classic); None where there are none."""
+        return sum(self.achievement_rewards) if self.achievements else None
 
 
 @struct.dataclass

@@ -1,4 +1,4 @@
-"""Craftax-classic as a pure environment: worlds, endings, rewards. Its frames: test_craftax_renderer.py."""
+"""Craftax-classic as a pure environment: worlds, endings, rewards. Its frames: test_craftax_classic_renderer.py."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from adapters.craftax import CLASSIC_SPEC, BuiltInAutoReset, make_classic
+from adapters.craftax import CLASSIC_SPEC, classic_built_in_auto_reset, make_classic
 
 
 def test_achievements_are_those_of_the_game_in_its_order():
@@ -17,6 +17,7 @@ def test_achievements_are_those_of_the_game_in_its_order():
 
     assert CLASSIC_SPEC.achievements == tuple(a.name.lower() for a in sorted(Achievement, key=lambda a: a.value))
     assert len(CLASSIC_SPEC.achievements) == CLASSIC_SPEC.max_return == 22
+    assert set(CLASSIC_SPEC.achievement_rewards) == {1.0}
     assert CLASSIC_SPEC.num_actions == len(Action) == 17
 
 
@@ -59,7 +60,7 @@ def test_batched_worlds_are_the_single_ones(environment):
 
 def test_built_in_auto_reset():
     """What `suite bench` compares with plays the same game: the types and the first frames' ranges agree."""
-    built_in = BuiltInAutoReset(2)
+    built_in = classic_built_in_auto_reset(2)
     key, action_B = jax.random.key(0), jnp.zeros(2, jnp.int32)
     first = jax.eval_shape(built_in.reset, key)
     then = jax.eval_shape(built_in.step, key, first[0], action_B)

@@ -210,10 +210,11 @@ def test_random_learns_nothing():
     assert_contains(settings("random"), expected)
 
 
+@pytest.mark.parametrize("task", ["craftax_classic", "craftax_full", "minatar/breakout"])
 @pytest.mark.parametrize("preset", ["paper", "small", "smoke"])
 @pytest.mark.parametrize("agent", sorted(registry.agents()))
-def test_every_agent_has_every_preset(agent, preset):
-    config = registry.resolve("craftax_classic", agent, preset)
+def test_every_agent_has_every_preset(agent, preset, task):
+    config = registry.resolve(task, agent, preset)
     assert config.iterations >= 2
     assert (config.agent, config.preset) == (agent, preset)
 
@@ -247,7 +248,35 @@ def test_schedule_of_imagined_updates():
     assert [config.imagined_updates(step) for step in (0, 500_000, 1_000_000)] == [0, 150, 300]
 
 
-@pytest.mark.parametrize("game", ["asterix", "breakout", "freeway", "space_invaders"])
+@pytest.mark.parametrize(
+    ("agent", "changes"),
+    [
+        ("mfrl", {"environment.num_envs": 64, "environment.rollout_length": 64}),
+        (
+            "m5_slow",
+            {
+                "environment.num_envs": 16,
+                "replay.capacity": 48_000,
+                "imagination.num_envs": 16,
+                "world_model.sequences": 15,  # 16 do not split into three minibatches
+            },
+        ),
+    ],
+)
+def test_craftax_full_differs_from_classic_in_what_the_paper_says_and_in_nothing_else(agent, changes):
+    """Table "Craftax-classic vs Craftax (full)" and fidelity note 28."""
+    ours = dotted(registry.resolve("craftax_full", agent, "paper"))
+    different = {name: value for name, value in ours.items() if value != settings(agent)[name]}
+    assert different == {"task": "craftax_full", **changes}
+
+
+@pytest.mark.parametrize("agent", sorted(registry.agents()))
+def test_craftax_full_s_model_free_agents_are_those_without_a_model(agent):
+    config = registry.resolve("craftax_full", agent, "paper")
+    assert config.replay.capacity == (48_000 if config.world_model.enabled else 128_000)
+
+
+@pytest.mark.parametrize("game", ["asterix", "breakout", "freeway", "seaquest", "space_invaders"])
 def test_minatar_differs_from_craftax_in_what_the_paper_says_and_in_nothing_else(game):
     """Tables "MFRL changes for MinAtar" and "MBRL changes for MinAtar"."""
     ours = dotted(registry.resolve(f"minatar/{game}", "m5", "paper"))

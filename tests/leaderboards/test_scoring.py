@@ -13,7 +13,7 @@ from leaderboards.best_response import Reference
 from suite.config import Config, EnvironmentConfig, PPOConfig, ProtocolConfig, ReplayConfig
 from tests.tiny import CORRIDOR_SPEC
 
-SPEC = dataclasses.replace(CORRIDOR_SPEC, achievements=("wood", "iron"), max_return=2.0)
+SPEC = dataclasses.replace(CORRIDOR_SPEC, achievements=("wood", "iron"), achievement_rewards=(1.0, 1.0))
 CONFIG = Config(
     "corridor",
     "m5",
@@ -53,6 +53,17 @@ def test_without_a_protocol_all_episodes_count():
     scores = scoring.craftax(ROWS and episodes().to_dict("records"), None, SPEC)
     assert (scores["episodes"], scores["final_episodes"]) == (6, 6)
     assert scores["reward_percent"] == pytest.approx(100 * 6 / 6 / 2)
+
+
+def test_achievements_that_pay_more_are_also_counted_by_tier():
+    spec = dataclasses.replace(SPEC, achievements=("wood", "iron", "bow"), achievement_rewards=(1.0, 1.0, 3.0))
+    rows = pd.DataFrame(ROWS, columns=COLUMNS).assign(bow=[0, 0, 0, 1, 0, 1])
+    rows["achievement_return"] += 3 * rows["bow"]
+    scores = scoring.craftax(rows, CONFIG, spec)
+    assert scores["reward_percent"] == pytest.approx(100 * (5.0 + 0.0) / 2 / 5)
+    assert scores["tier_percent/basic"] == pytest.approx((60 + 20) / 2)
+    assert scores["tier_percent/intermediate"] == pytest.approx(20)
+    assert not [name for name in scoring.craftax(episodes(), CONFIG, SPEC) if name.startswith("tier")]
 
 
 @pytest.mark.parametrize(("rates", "score"), [([0.0] * 22, 0.0), ([100.0] * 22, 100.0), ([100.0] + [0.0] * 21, 0.2334)])

@@ -1,20 +1,16 @@
-"""Draws the frames of Craftax-classic: the pixels of craftax's own renderer, for much less work.
-
-craftax adds up one full-screen layer for every kind of block, and first prepares textures for half a minute; here
-tiles are looked up, and the few small images that agents see are read from the package in milliseconds.
-"""
+"""Draws the frames of Craftax-classic: the pixels of craftax's own renderer, for much less work."""
 
 from __future__ import annotations
 
-import math
+import functools
 from collections.abc import Callable
-from importlib import resources
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from PIL import Image
+
+from adapters.craftax_tiles import draw, heading, image, pixels, turned, uniform
 
 TILE, ICON, DIGIT, DIGIT_OFFSET = 7, 5, 4, 2  # pixels; an inventory slot is an icon with a digit over its corner
 ROWS, COLUMNS = VIEW = (7, 9)  # tiles of the map that are seen, the player in the middle
@@ -63,6 +59,8 @@ ITEMS = [
 ]
 CUT_OUT = {"stone_pickaxe", "iron_pickaxe", "wood_sword", "stone_sword", "iron_sword"}
 
+_image = functools.partial(image, "craftax_classic")
+
 NIGHT, SLEEP = np.array([[[0, 16, 64]]], np.float32), np.array([[[0, 0, 16]]], np.float32)
 
 
@@ -77,12 +75,12 @@ def make_renderer() -> Callable[[Any], jax.Array]:
         padded = jnp.pad(state.map, MARGIN, constant_values=OUT_OF_BOUNDS)
         seen = jax.lax.dynamic_slice(padded, state.player_position - CENTER + MARGIN, VIEW)
         tiles = _draw_creatures(blocks[seen], state, color, alpha)
-        scene = _pixels(tiles)
+        scene = pixels(tiles)
         scene = _light(scene, state, darkness)
 
         counts = [getattr(state, f"player_{need}") for need in NEEDS]
         counts += [getattr(state.inventory, item) for item in ITEMS] + [jnp.int32(0)] * 2
-        inventory = _pixels(slots[np.arange(len(counts)), jnp.stack(counts)].reshape(2, COLUMNS, TILE, TILE, 3))
+        inventory = pixels(slots[np.arange(len(counts)), jnp.stack(counts)].reshape(2, COLUMNS, TILE, TILE, 3))
         return jnp.concatenate([scene, inventory])
 
     return render
@@ -90,8 +88,7 @@ def make_renderer() -> Callable[[Any], jax.Array]:
 
 def _draw_creatures(tiles: jax.Array, state: Any, color: jax.Array, alpha: jax.Array) -> jax.Array:
     """Blends the player and the creatures over their tiles, in craftax's order (two may share a tile)."""
-    down, right = state.arrow_directions[:, 0], state.arrow_directions[:, 1]
-    arrows = ARROW + jnp.where((down > 0) | (right > 0), 1, 0) + jnp.where(right != 0, 2, 0)
+    arrows = ARROW + heading(state.arrow_directions)
     player = jnp.where(state.is_sleeping, ASLEEP, state.player_direction - 1)
     groups: list[tuple[Any, Any]] = [
         (state.zombies, ZOMBIE),
@@ -104,15 +101,7 @@ def _draw_creatures(tiles: jax.Array, state: Any, color: jax.Array, alpha: jax.A
     alive = [jnp.ones(1, bool)] + [mobs.mask for mobs, _ in groups]
 
     at = jnp.concatenate(position) - (state.player_position - CENTER)[None]
-    visible = jnp.concatenate(alive) & ((at >= 0) & (at < np.array([VIEW]))).all(axis=-1)
-    row = jnp.where(visible, at[:, 0], ROWS)  # beyond the view, where writes are dropped
-
-    def draw(tiles, one):
-        row, column, sprite = one
-        old = tiles.at[row, column].get(mode="clip")
-        return tiles.at[row, column].set(old * (1 - alpha[sprite]) + color[sprite], mode="drop"), None
-
-    return jax.lax.scan(draw, tiles, (row, at[:, 1], jnp.concatenate(which)), unroll=True)[0]
+    return draw(tiles, at, jnp.concatenate(alive), jnp.concatenate(which), color, alpha)
 
 
 def _light(scene: jax.Array, state: Any, darkness: jax.Array) -> jax.Array:
@@ -127,35 +116,9 @@ def _light(scene: jax.Array, state: Any, darkness: jax.Array) -> jax.Array:
     return jnp.where(state.is_sleeping, 0.5 * _luminance(scene) + 0.5 * SLEEP, scene)
 
 
-def uniform(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """The float32 numbers in [0, 1) of `jax.random.uniform(key, shape)`, for a threefry key.
-
-    On a CPU, JAX keeps the rounds of the cipher in a loop, and the numbers go through memory between rounds. Written
-    out, they are one pass: drawing the night is the largest part of a frame, and this saves half of it.
-    """
-    first, second = jax.random.key_data(key)
-    schedule = first, second, first ^ second ^ np.uint32(0x1BD11BDA)
-    low = jnp.arange(math.prod(shape), dtype=jnp.uint32) + second[None]
-    high = jnp.broadcast_to(first, low.shape)
-    for block in range(5):
-        for turn in ((13, 15, 26, 6), (17, 29, 16, 24))[block % 2]:
-            high = high + low
-            low = high ^ ((low << np.uint32(turn)) | (low >> np.uint32(32 - turn)))
-        high = high + schedule[(block + 1) % 3][None]
-        low = low + (schedule[(block + 2) % 3] + np.uint32(block + 1))[None]
-    bits = (high ^ low) >> np.uint32(9)  # 23 random bits become the fraction of a number in [1, 2)
-    return (jax.lax.bitcast_convert_type(bits | np.uint32(0x3F800000), jnp.float32) - 1).reshape(shape)
-
-
 def _luminance(scene: jax.Array) -> jax.Array:
     red, green, blue = jnp.split(scene, 3, axis=-1)
     return 0.299 * red + 0.587 * green + 0.114 * blue
-
-
-def _pixels(tiles: jax.Array) -> jax.Array:
-    """[rows, columns, 7, 7, 3] -> [rows * 7, columns * 7, 3]."""
-    rows, columns = tiles.shape[:2]
-    return tiles.swapaxes(1, 2).reshape(rows * TILE, columns * TILE, 3)
 
 
 def _blocks() -> np.ndarray:
@@ -167,9 +130,7 @@ def _blocks() -> np.ndarray:
 
 def _creatures() -> tuple[np.ndarray, np.ndarray]:
     """Colors times opacity [12, 7, 7, 3], and opacity [12, 7, 7, 1]; float32."""
-    up = _image("arrow-up", TILE)
-    down = up[::-1]
-    arrows = [up, down, up.swapaxes(0, 1), down.swapaxes(0, 1)]  # up, down, left, right
+    arrows = turned(_image("arrow-up", TILE))
     images = np.stack([_image(name, TILE) for name in CREATURES] + arrows)
     alpha = images[..., 3:] / np.float32(255)
     return images[..., :3] * alpha, alpha
@@ -194,10 +155,3 @@ def view_darkness() -> np.ndarray:
     """How much of the night's noise lies over each pixel, float32 [49, 63, 1]: none in the middle."""
     y, x = (np.linspace(-1, 1, tiles * TILE) for tiles in VIEW)
     return (1 - np.exp(-0.5 * (y[:, None] ** 2 + x**2) / 0.5**2))[..., None].astype(np.float32)
-
-
-def _image(name: str, side: int) -> np.ndarray:
-    """An image of the package as float32 [side, side, 4]: red, green, blue, opacity; 0 to 255."""
-    file = resources.files("craftax.craftax_classic") / "assets" / f"{name}.png"
-    with file.open("rb") as stream, Image.open(stream) as image:
-        return np.asarray(image.convert("RGBA").resize((side, side), Image.Resampling.NEAREST), np.float32)

@@ -7,28 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from adapters.craftax_renderer import make_renderer, uniform
-from adapters.numerics import loose_numerics
+from adapters.craftax_classic_renderer import make_renderer
+from adapters.craftax_tiles import uniform
+from tests.adapters.frames import check_equal, original_renderer
 
 FRAMES = 512
-ROUNDING = 1e-4  # of 255: the last bits of float32
-
-
-def make_original():
-    """craftax's own renderer from `EnvState` to float frames in [0, 255], with textures of the one size it needs."""
-    from craftax.craftax_classic import constants, renderer
-
-    size = constants.BLOCK_PIXEL_SIZE_AGENT
-    with pytest.MonkeyPatch.context() as patch, loose_numerics():
-        textures = {size: constants.load_all_textures_given_size(size)}
-        patch.setattr(renderer, "load_all_textures", lambda: textures)
-        render = renderer.make_craftax_pixel_renderer(size)
-
-    def original(state):
-        with loose_numerics():
-            return render(state)
-
-    return original
 
 
 def arbitrary_state(key: jax.Array, state):
@@ -77,17 +60,10 @@ def arbitrary_state(key: jax.Array, state):
 @pytest.fixture(scope="module")
 def renderers():
     """Both renderers over 512 states: ours and craftax's, float32 in [0, 255]."""
-    return tuple(jax.jit(jax.vmap(render)) for render in (make_renderer(), make_original()))
+    from craftax.craftax_classic import constants, renderer
 
-
-def check_equal(ours, theirs):
-    """Equal bytes, but where craftax's own value is a tie: the same code compiled otherwise rounds those otherwise."""
-    ours, theirs = np.asarray(ours), np.asarray(theirs)
-    assert ours.shape == theirs.shape and ours.dtype == np.float32
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=ROUNDING)
-    tie = np.abs(theirs % 1 - 0.5) < ROUNDING
-    np.testing.assert_array_equal(np.round(ours)[~tie], np.round(theirs)[~tie])
-    assert (np.round(ours) != np.round(theirs)).mean() < 1e-5
+    original = original_renderer(constants, renderer, "make_craftax_pixel_renderer")
+    return tuple(jax.jit(jax.vmap(render)) for render in (make_renderer(), original))
 
 
 def test_arbitrary_states(environment, renderers):
