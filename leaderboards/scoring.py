@@ -39,7 +39,7 @@ def craftax(
       reward_percent_with_health: the same with the reward for health.
       score_percent: Crafter's score over all episodes, see `crafter_score`; nan if there are none.
       success_percent/<achievement>: the share of all episodes that unlocked it.
-      tier_percent/<tier>: the mean of that over the achievements that pay the same, where not all do (`TIERS`).
+      success_percent_<tier>: the mean of that over the achievements that pay the same, where not all do (`TIERS`).
       episodes, final_episodes: how many there were.
     """
     assert spec.max_return is not None
@@ -56,7 +56,11 @@ def craftax(
         "episodes": len(episodes),
         "final_episodes": len(final),
         **{f"success_percent/{name}": percent for name, percent in success.items()},
-        **({f"tier_percent/{name}": float(np.mean(rates)) for name, rates in tiers.items()} if len(tiers) > 1 else {}),
+        **(
+            {f"success_percent_{name}": float(np.mean(rates)) for name, rates in tiers.items()}
+            if len(tiers) > 1
+            else {}
+        ),
     }
 
 

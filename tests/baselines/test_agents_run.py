@@ -1,4 +1,4 @@
-"""Every agent, two whole iterations of Algorithm 1, imagination in the second, on a tiny task."""
+"""Every agent on a tiny task, and the ladder on MinAtar: two whole iterations of Algorithm 1, the second one dreams."""
 
 from __future__ import annotations
 
@@ -19,10 +19,17 @@ def hasty_compilation():
     jax.config.update("jax_disable_most_optimizations", False)
 
 
-@pytest.mark.parametrize("agent", sorted(registry.agents()))
-def test_two_iterations(agent, tmp_path, monkeypatch):
+LADDER = ("m1", "m2", "m3", "m4", "m5")
+
+
+@pytest.mark.parametrize(
+    ("task", "agent"),
+    [("wide_corridor", agent) for agent in sorted(registry.agents())]
+    + [("minatar/breakout", agent) for agent in LADDER],  # as the paper's Figure "MinAtar"
+)
+def test_two_iterations(task, agent, tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
-    config = registry.resolve("wide_corridor", agent, "smoke")
+    config = registry.resolve(task, agent, "smoke")
     result = run.run(config, tmp_path, QuietReporter())
     assert (result.status, result.steps) == ("finished", 64)
     metrics = pd.read_csv(result.folder / "metrics.csv")

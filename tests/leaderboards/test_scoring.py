@@ -61,9 +61,9 @@ def test_achievements_that_pay_more_are_also_counted_by_tier():
     rows["achievement_return"] += 3 * rows["bow"]
     scores = scoring.craftax(rows, CONFIG, spec)
     assert scores["reward_percent"] == pytest.approx(100 * (5.0 + 0.0) / 2 / 5)
-    assert scores["tier_percent/basic"] == pytest.approx((60 + 20) / 2)
-    assert scores["tier_percent/intermediate"] == pytest.approx(20)
-    assert not [name for name in scoring.craftax(episodes(), CONFIG, SPEC) if name.startswith("tier")]
+    assert scores["success_percent_basic"] == pytest.approx((60 + 20) / 2)
+    assert scores["success_percent_intermediate"] == pytest.approx(20)
+    assert not [name for name in scoring.craftax(episodes(), CONFIG, SPEC) if name.startswith("success_percent_")]
 
 
 @pytest.mark.parametrize(("rates", "score"), [([0.0] * 22, 0.0), ([100.0] * 22, 100.0), ([100.0] + [0.0] * 21, 0.2334)])
