@@ -19,13 +19,13 @@ def hasty_compilation():
     jax.config.update("jax_disable_most_optimizations", False)
 
 
-LADDER = ("m1", "m2", "m3", "m4", "m5")
+RUNGS = ("m1", "m3", "m5")  # m2 and m4 differ from these in what the tiny task shows as well
 
 
 @pytest.mark.parametrize(
     ("task", "agent"),
     [("wide_corridor", agent) for agent in sorted(registry.agents())]
-    + [("minatar/breakout", agent) for agent in LADDER],  # as the paper's Figure "MinAtar"
+    + [("minatar/breakout", agent) for agent in RUNGS],  # as the paper's Figure "MinAtar"
 )
 def test_two_iterations(task, agent, tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
