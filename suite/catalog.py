@@ -24,7 +24,7 @@ def _game(name: str, summary: str = "", cost: str = "") -> TaskEntry:
     )
 
 
-def _minatar(name: str, summary: str) -> TaskEntry:
+def _minatar(name: str, summary: str, cost: str = "small on one CPU core: m5 4 min, mfrl 1, 1.0 GiB") -> TaskEntry:
     return TaskEntry(
         id=f"minatar/{name}",
         family="minatar",
@@ -37,6 +37,7 @@ def _minatar(name: str, summary: str) -> TaskEntry:
             "small": Lazy("baselines.presets:minatar_small"),
             "smoke": Lazy("baselines.presets:minatar_smoke"),
         },
+        cost=cost,
     )
 
 
@@ -64,9 +65,21 @@ FAMILIES: dict[str, Callable[[str], TaskEntry]] = {
 }
 
 TASKS = (
-    _game("tic_tac_toe", "tic-tac-toe against a uniform opponent, both seats: 27 symbols, 9 actions"),
-    _game("leduc", "Leduc poker against a uniform opponent, both seats: 16 symbols, 3 actions, 6 chance outcomes"),
-    _game("bargaining", "bargaining, uniform opponent, both seats: 93 symbols, 121 actions, 1002 chance outcomes"),
+    _game(
+        "tic_tac_toe",
+        "tic-tac-toe against a uniform opponent, both seats: 27 symbols, 9 actions",
+        "small on two CPU cores: m5 5 min, mfrl 0.1, 0.8 GiB",
+    ),
+    _game(
+        "leduc",
+        "Leduc poker against a uniform opponent, both seats: 16 symbols, 3 actions, 6 chance outcomes",
+        "small on two CPU cores: m5 5 min, mfrl 0.4, 1.3 GiB",
+    ),
+    _game(
+        "bargaining",
+        "bargaining, uniform opponent, both seats: 93 symbols, 121 actions, 1002 chance outcomes",
+        "small on two CPU cores: m5 4 min, mfrl 0.3, 1.6 GiB",
+    ),
     _minatar("asterix", "MinAtar's Asterix: gold and enemies; 10x10x4, 5 actions"),
     _minatar("breakout", "MinAtar's Breakout; 10x10x4, 3 actions"),
     _minatar("freeway", "MinAtar's Freeway: cross between cars; 10x10x7, 3 actions"),

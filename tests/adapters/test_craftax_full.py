@@ -177,7 +177,7 @@ def test_frames_of_arbitrary_states(environment, renderers):
     # Not by drawing nothing: all levels, nights and sleep are there, and frames differ everywhere.
     assert len(np.unique(states.player_level)) == 9 and states.is_sleeping.any() and (states.light_level < 0.1).any()
     varied = ours.std(axis=0).max(axis=-1) > 0
-    assert varied[:90].all() and varied[90:].mean() > 0.4
+    assert varied[:90].all() and varied[90:].mean() > 0.3
 
 
 def test_frames_of_play(play, renderers):
