@@ -10,34 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from adapters.craftax_tiles import draw, heading, image, pixels, turned, uniform
+from adapters.craftax_tiles import BLOCKS, GRAY, OUT_OF_BOUNDS, draw, heading, image, pixels, turned, uniform
 
 TILE, ICON, DIGIT, DIGIT_OFFSET = 7, 5, 4, 2  # pixels; an inventory slot is an icon with a digit over its corner
 ROWS, COLUMNS = VIEW = (7, 9)  # tiles of the map that are seen, the player in the middle
 CENTER = np.array(VIEW, np.int32) // 2
 MARGIN = max(VIEW)
 
-# By number of craftax's BlockType, whose second is plain gray and lies beyond the map's edge.
-BLOCKS = [
-    "debug_tile",
-    "debug_tile",
-    "grass",
-    "water",
-    "stone",
-    "tree",
-    "wood",
-    "path",
-    "coal",
-    "iron",
-    "diamond",
-    "table",
-    "furnace",
-    "sand",
-    "lava",
-    "plant_on_grass",
-    "ripe_plant_on_grass",
-]
-OUT_OF_BOUNDS, GRAY = 1, 128
 # The player's are in the order of the moves left, right, up, down. Four directions of the arrow follow.
 CREATURES = ["player-left", "player-right", "player-up", "player-down", "player-sleep", "zombie", "cow", "skeleton"]
 ASLEEP, ZOMBIE, COW, SKELETON, ARROW = 4, 5, 6, 7, 8

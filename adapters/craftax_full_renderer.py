@@ -10,31 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from adapters.craftax_tiles import draw, heading, image, pixels, turned, uniform
+from adapters.craftax_tiles import BLOCKS, GRAY, OUT_OF_BOUNDS, draw, heading, image, pixels, turned, uniform
 
 TILE, BORDER, DIGIT = 10, 1, 4  # pixels; an inventory slot is an icon within a border, digits over its lower edge
 ROWS, COLUMNS = VIEW = (9, 11)  # tiles of the map that are seen, the player in the middle
 CENTER = np.array(VIEW, np.int32) // 2
 
-# By number of craftax's BlockType. The second, beyond the map's edge, is plain gray, and darkness is black.
-BLOCKS = [
-    "debug_tile",
-    "debug_tile",
-    "grass",
-    "water",
-    "stone",
-    "tree",
-    "wood",
-    "path",
-    "coal",
-    "iron",
-    "diamond",
-    "table",
-    "furnace",
-    "sand",
-    "lava",
-    "plant_on_grass",
-    "ripe_plant_on_grass",
+# The blocks that this game adds to the other's; darkness is black.
+ALL_BLOCKS = [
+    *BLOCKS,
     "wall2",
     "debug_tile",
     "wall_moss",
@@ -56,7 +40,7 @@ BLOCKS = [
     "grave3",
     "necromancer_vulnerable",
 ]
-OUT_OF_BOUNDS, GRAY, DARKNESS, NECROMANCER, VULNERABLE = 1, 128, 18, 32, 36
+DARKNESS, NECROMANCER, VULNERABLE = 18, 32, 36
 
 # By number of craftax's ItemType, from 1 on. A way down is blocked until enough of its level's monsters are dead.
 ITEMS = ["torch_in_inventory", "ladder_down", "ladder_up", "ladder_down_blocked"]
@@ -195,7 +179,7 @@ def _inventory(state: Any) -> dict[str, Any]:
 
 def _blocks() -> np.ndarray:
     """float32 [37, 10, 10, 3]."""
-    blocks = np.stack([_image(name, TILE)[..., :3] for name in BLOCKS])
+    blocks = np.stack([_image(name, TILE)[..., :3] for name in ALL_BLOCKS])
     blocks[OUT_OF_BOUNDS], blocks[DARKNESS] = GRAY, 0
     return blocks
 

@@ -26,12 +26,12 @@ from adapters.craftax_classic_renderer import (
     ITEMS,
     MARGIN,
     NEEDS,
-    OUT_OF_BOUNDS,
     ROWS,
     TILE,
     VIEW,
     view_darkness,
 )
+from adapters.craftax_tiles import OUT_OF_BOUNDS
 
 VALUES = 17
 BLANK = 0  # a tile that the night hides, and a tile without a creature

@@ -14,6 +14,28 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
+# By number of craftax's BlockType, the same in both games. The second, beyond the map's edge, is plain gray.
+BLOCKS = [
+    "debug_tile",
+    "debug_tile",
+    "grass",
+    "water",
+    "stone",
+    "tree",
+    "wood",
+    "path",
+    "coal",
+    "iron",
+    "diamond",
+    "table",
+    "furnace",
+    "sand",
+    "lava",
+    "plant_on_grass",
+    "ripe_plant_on_grass",
+]
+OUT_OF_BOUNDS, GRAY = 1, 128
+
 
 def image(game: str, name: str, side: int) -> np.ndarray:
     """An image of the package `craftax.<game>` as float32 [side, side, 4]: red, green, blue, opacity; 0 to 255."""
