@@ -115,6 +115,7 @@ TASKS = (
             "smoke": Lazy("baselines.presets:craftax_full_smoke"),
         },
         own_auto_reset=Lazy("adapters.craftax:full_built_in_auto_reset"),
+        cost="compiles for 1 min at first; small on one CPU core: m5 10 min, mfrl 5, 3.5 GiB; paper: an accelerator",
         paper_agent="m5_slow",
     ),
 )
