@@ -1,0 +1,38 @@
+"""`suite bench`: time, share and speed of each phase."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+
+from suite.commands.configuration import add_configuration
+from suite.commands.printing import device_name, format_value, make_reporter, print_json, print_table
+
+SUMMARY = "time, share and speed of each phase"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_configuration(parser)
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def execute(args: argparse.Namespace) -> int:
+    from suite import registry
+
+    config = registry.resolve(args.task, args.agent, args.preset, args.overrides, 0, args.steps)
+
+    from suite import bench
+
+    if not args.quiet:
+        print(f"{config.task}, agent {config.agent}, preset {config.preset}, on {device_name()}", flush=True)
+    measured = bench.bench(config, make_reporter(args.quiet))
+    parts = measured if isinstance(measured, Mapping) else {"phases": measured}
+    for name, part in parts.items():
+        if isinstance(part, list):
+            columns = list(dict.fromkeys(column for row in part for column in row))
+            print_table([columns, *([format_value(row.get(column, "")) for column in columns] for row in part)])
+        else:
+            print(f"{name}  {format_value(part)}")
+    if args.json:
+        print_json(parts)
+    return 0

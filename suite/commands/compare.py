@@ -1,0 +1,37 @@
+"""`suite compare`: finished runs as Markdown tables."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+from suite.commands.printing import print_json
+from suite.errors import UserError
+
+SUMMARY = "finished runs: scores and curves, mean and standard error over seeds, as Markdown tables"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="runs in or below it are compared")
+    parser.add_argument("--parts", type=int, default=5, metavar="N", help="points of a curve (default 5)")
+    parser.add_argument("--score", metavar="S", help="what curves are of (default: return, or the first score)")
+
+
+def execute(args: argparse.Namespace) -> int:
+    if args.parts < 1:
+        raise UserError(f"--parts={args.parts}: must be at least 1")
+
+    from leaderboards.compare import compare, records_in, tables
+
+    comparisons = compare(records_in(args.folders), args.parts, args.score)
+    for found in comparisons:
+        print(f"{found.task}, preset {found.preset}, {found.steps:,} steps\n")
+        for table in tables(found):
+            head = list(map(str, table.columns))
+            for row in (head, ["---"] * len(head), *table.to_numpy().tolist()):
+                print(f"| {' | '.join(row)} |")
+            print()
+    if args.json:
+        print_json([dataclasses.asdict(found) for found in comparisons])
+    return 0

@@ -1,0 +1,31 @@
+"""The options with which commands name a configuration: task, agent, preset, steps, single fields."""
+
+from __future__ import annotations
+
+import argparse
+import re
+
+
+def add_configuration(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `suite.registry.resolve`."""
+    parser.add_argument("task", metavar="TASK", help="see `suite list tasks`")
+    parser.add_argument(
+        "--agent", metavar="A", help="see `suite list agents` (default m5; craftax_full paper: m5_slow)"
+    )
+    parser.add_argument("--preset", metavar="P", help="see `suite list presets` (default: fit for this machine)")
+    parser.add_argument("--steps", type=int, metavar="N", help="real environment steps (default: the preset's)")
+    parser.add_argument(
+        "overrides", nargs="*", default=[], metavar="dotted.name=value", help="any field that `suite describe` shows"
+    )
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Seeds of "0-2" or "0,3,5", or of both mixed."""
+    seeds: list[int] = []
+    for part in text.split(","):
+        match = re.fullmatch(r"([0-9]+)(?:-([0-9]+))?", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
+        if last < first:
+            raise argparse.ArgumentTypeError(f"{text!r} is not of the form 0-2 or 0,3,5")
+        seeds += range(first, last + 1)
+    return list(dict.fromkeys(seeds))

@@ -1,0 +1,48 @@
+"""`suite describe`: the whole configuration, layers and parameter counts, without running anything."""
+
+from __future__ import annotations
+
+import argparse
+
+from suite.commands.configuration import add_configuration as add_arguments
+from suite.commands.list import published
+from suite.commands.printing import print_json, print_table
+
+__all__ = ["SUMMARY", "add_arguments", "execute"]
+
+SUMMARY = "the whole configuration, layers and parameter counts, without running anything"
+
+
+def execute(args: argparse.Namespace) -> int:
+    from suite import registry
+
+    layers = registry.layers(args.task, args.agent, args.preset, args.overrides, 0, args.steps)
+
+    from suite.describe import describe
+
+    description = describe(layers, registry.task(args.task).spec())
+    if args.json:
+        print_json(description.as_dict())
+        return 0
+    print("Configuration (value, source)")
+    print_table([s.name, str(s.value), s.source] for s in description.settings)
+    for module, modules_layers in description.modules.items():
+        unit = "numbers" if module == "codebook" else "parameters"
+        print(f"\n{module.replace('_', ' ').capitalize()}: {description.parameters(module):,} {unit}")
+        print_table(
+            [
+                layer.name,
+                " ".join(f"{name}{list(shape)}" for name, shape in layer.shapes.items()),
+                f"{layer.parameters:,}",
+            ]
+            for layer in modules_layers
+        )
+    networks = [name for name in description.modules if name != "codebook"]
+    counted = [f"{name.replace('_', ' ')} {description.parameters(name):,}" for name in networks]
+    counted.append(f"2 x codebook {description.parameters('codebook'):,} (stored twice in the paper's bookkeeping)")
+    print(f"\nTotal: {description.total:,}{' = ' + ' + '.join(counted) if 'codebook' in description.modules else ''}")
+    if row := published(registry.agent(layers[-1][1].agent)):
+        print(f"Published for craftax_classic: {row}")
+    print("\nDerived")
+    print_table([name, f"{value:,}", how] for name, value, how in description.derived)
+    return 0
