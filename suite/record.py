@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from suite.interface.environment import EnvironmentSpec
 
 SCHEMA = 1
+LOCK = "run.lock"
 # Fields without which a record can be neither read nor gone on with.
 NEEDED = frozenset({"protocol", "columns", "status", "steps", "wall_clock_seconds", "peak_memory_bytes", "resumed"})
 
@@ -234,11 +235,11 @@ class RunRecord:
         Each row has `step` (real steps of the run when it ended), `return`, `length`, the task's scalar statistics,
         and 0 or 1 for each achievement, all by name.
         """
-        self._tables["episodes"].append(rows)
+        self._append("episodes", rows)
 
     def append_evaluation(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Adds evaluation episodes: as `append_episodes`, `step` being that of the checkpoint."""
-        self._tables["evaluations"].append(rows)
+        self._append("evaluations", rows)
 
     def has_evaluation(self, step: int) -> bool:
         """Whether there are evaluation episodes of the checkpoint at `step`."""
@@ -252,7 +253,7 @@ class RunRecord:
         """
         from suite.event_files import EventFile
 
-        self._tables["metrics"].append([row], names)
+        self._append("metrics", [row], names)
         self.fields["steps"] = int(row["step"])
         if self._events is None:
             self._events = EventFile(self.folder / "tensorboard", self._purge_step)
@@ -261,7 +262,22 @@ class RunRecord:
 
     def append_timing(self, row: Mapping[str, Any]) -> None:
         """Adds one iteration's seconds per phase, `step` first. The first row fixes the columns."""
-        self._tables["timing"].append([row])
+        self._append("timing", [row])
+
+    def _append(self, table: str, rows: Iterable[Mapping[str, Any]], names: Iterable[str] = ()) -> None:
+        self._require_own_folder()
+        self._tables[table].append(rows, names)
+
+    def _require_own_folder(self) -> None:
+        """Raises a RunError if the folder was removed, or made anew by another run: rows of the two would mix."""
+        assert self._lock is not None, "opened for reading only"
+        held = os.fstat(self._lock.fileno())
+        try:
+            found = (self.folder / LOCK).stat()
+        except OSError:
+            found = None
+        if found is None or (held.st_dev, held.st_ino) != (found.st_dev, found.st_ino):
+            raise RunError(f"{self.folder} was removed or replaced while this run was writing into it")
 
     def rewind(self, step: int) -> int:
         """Goes back to a checkpoint: rows beyond `step` move to `replaced/`. Returns how many did.
@@ -285,6 +301,7 @@ class RunRecord:
         """Replaces fields of record.json."""
         if unknown := fields.keys() - self.fields.keys():
             raise ValueError(f"record.json has no field {', '.join(sorted(unknown))}")
+        self._require_own_folder()
         self.fields |= fields
         _write_json(self.folder / "record.json", self.fields)
 
@@ -329,7 +346,7 @@ class RunRecord:
 def _acquire(folder: Path) -> IO[str]:
     """The exclusive lock on a folder, held until the file is closed or its process ends, however it ends."""
     try:
-        file = (folder / "run.lock").open("a+")
+        file = (folder / LOCK).open("a+")
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
     try:
@@ -385,10 +402,14 @@ def _write_json(path: Path, value: Any) -> None:
     write_whole(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
+def _no_number(text: str) -> Any:
+    raise ValueError(f"{text} is not a number that JSON has")
+
+
 def _read_json(folder: Path, name: str) -> dict[str, Any]:
     path = folder / name
     try:
-        value = json.loads(path.read_text())
+        value = json.loads(path.read_text(), parse_constant=_no_number)
     except FileNotFoundError:
         raise UserError(f"{folder} is no run folder: it has no {name}") from None
     except OSError as error:

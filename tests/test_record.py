@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import shutil
 import subprocess
 import sys
 
@@ -33,7 +34,8 @@ def play(record, steps):
 
 
 def contents(folder):
-    return {name: (folder / f"{name}.csv").read_bytes() for name in ("episodes", "metrics", "evaluations", "timing")}
+    names = ("episodes", "metrics", "evaluations", "timing")
+    return {name: path.read_bytes() for name in names if (path := folder / f"{name}.csv").exists()}
 
 
 def create(tmp_path, config=CONFIG):
@@ -317,3 +319,27 @@ def test_curves_can_be_read_back(tmp_path):
         events.append(records)
     assert [(e.step, e.summary.value[0].tag) for e in events[0] if e.summary.value] == [(5, "loss")]
     assert [e.step for e in events[1] if e.HasField("session_log")] == [7]
+
+
+@pytest.mark.parametrize("again", [False, True], ids=["removed", "made anew"])
+def test_a_folder_that_was_replaced_is_not_written_into(tmp_path, again):
+    with create(tmp_path) as old:
+        shutil.rmtree(old.folder)
+        new = create(tmp_path) if again else None
+        before = contents(new.folder) if new else {}
+        for write in (lambda: play(old, [10]), lambda: old.update(status="failed")):
+            with pytest.raises(RunError, match="was removed or replaced while this run was writing"):
+                write()
+        if new:
+            assert contents(new.folder) == before
+            new.close()
+        else:
+            assert not old.folder.exists()
+
+
+def test_a_record_with_nan_is_damaged(tmp_path):
+    with create(tmp_path) as record:
+        path = record.folder / "record.json"
+    path.write_text(path.read_text().replace('"total": 0.0', '"total": NaN'))
+    with pytest.raises(UserError, match=r"record.json is damaged: NaN is not a number that JSON has"):
+        RunRecord.open(record.folder, lock=False)
