@@ -6,6 +6,7 @@ an `AgentEntry`. This module imports neither JAX nor any game.
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
@@ -149,7 +150,7 @@ def _find_task(id: str) -> TaskEntry:
 def _with_plugins(own: tuple[Entry, ...], group: str, kind: type[Entry]) -> dict[str, Entry]:
     """Entries by id; ours cannot be replaced by another distribution's."""
     found = {}
-    for point in importlib.metadata.entry_points(group=group):
+    for point in _entry_points(group):
         try:
             entry = point.load()
         except Exception as error:  # whatever another distribution's module raises
@@ -158,3 +159,8 @@ def _with_plugins(own: tuple[Entry, ...], group: str, kind: type[Entry]) -> dict
             raise UserError(f"entry point {point.name!r} of {group} is no {kind.__name__}")
         found[entry.id] = entry
     return {entry.id: entry for entry in own} | {id: e for id, e in found.items() if id not in {o.id for o in own}}
+
+
+@functools.cache  # reads the metadata of every installed distribution
+def _entry_points(group: str) -> tuple[importlib.metadata.EntryPoint, ...]:
+    return tuple(importlib.metadata.entry_points(group=group))

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import importlib.metadata
-
 import pytest
 
 from suite import registry
@@ -103,7 +101,7 @@ class Point:
 
 
 def install(monkeypatch, load):
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [Point(load)])
+    monkeypatch.setattr(registry, "_entry_points", lambda group: [Point(load)])
 
 
 def test_other_distributions_add_but_do_not_replace(monkeypatch):
