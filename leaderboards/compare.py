@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
-import numpy as np
 import pandas as pd
 
-from suite import registry
+from leaderboards.results import Entry, entries_of
+from leaderboards.scoring import main_score
+from leaderboards.statistics import mean_and_standard_error
 from suite.errors import UserError, did_you_mean
 from suite.record import RunRecord
 
 Spread = tuple[float, float]  # mean and standard error; nan where there is none
-COUNTS = frozenset({"episodes", "final_episodes"})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,21 +41,6 @@ class Comparison:
     curve: dict[str, list[Spread]]
 
 
-def records_in(folders: Sequence[Path]) -> list[RunRecord]:
-    """Every finished run in these folders or below them.
-
-    Raises:
-      UserError: there is none, or one cannot be read.
-    """
-    paths = sorted({path.parent for folder in folders for path in folder.rglob("record.json")})
-    records = [RunRecord.open(path, lock=False) for path in paths]
-    finished = [record for record in records if record.finished]
-    if not finished:
-        begun = f"; {len(records)} unfinished" if records else ""
-        raise UserError(f"no finished run in {', '.join(map(str, folders))}{begun}")
-    return finished
-
-
 def compare(records: Sequence[RunRecord], parts: int = 5, score: str | None = None) -> list[Comparison]:
     """What agents scored, one comparison for each protocol and preset: those of different ones mean nothing together.
 
@@ -68,70 +52,44 @@ def compare(records: Sequence[RunRecord], parts: int = 5, score: str | None = No
     Raises:
       UserError: a score that a task has not, or two runs of one seed that differ in their settings.
     """
-    groups: dict[tuple[str, str], list[RunRecord]] = {}
-    for record in records:
-        groups.setdefault((record.fields["protocol_hash"], record.config.preset), []).append(record)
+    groups: dict[tuple[str, str], list[Entry]] = {}
+    for entry in entries_of(records):
+        key = (entry.records[0].fields["protocol_hash"], entry.config.preset)
+        groups.setdefault(key, []).append(entry)
     return [_compare(group, parts, score) for group in groups.values()]
 
 
-def _compare(records: list[RunRecord], parts: int, score: str | None) -> Comparison:
-    config = records[0].config
-    _require_one_run_a_seed(records)
-    task = registry.task(config.task)
-    scores_of, spec = task.scores(), task.spec()
-    ids = list(registry.agents())
-    by_agent: dict[str, list[RunRecord]] = {}
-    for record in sorted(records, key=lambda r: (_place(ids, r.config.agent), r.config.agent, r.config.seed)):
-        by_agent.setdefault(record.config.agent, []).append(record)
-    found: dict[str, list[dict[str, float]]] = {}
-    pieces: dict[str, list[list[dict[str, float]]]] = {}
-    for agent, runs in by_agent.items():
-        for record in runs:
-            episodes = record.episodes()
-            part = np.ceil(episodes["step"] * parts / config.protocol.steps).astype(int)  # 1 to `parts`
-            found.setdefault(agent, []).append(scores_of(episodes, record.config, spec))
-            pieces.setdefault(agent, []).append([scores_of(episodes[part == i + 1], None, spec) for i in range(parts)])
-    names = [name for name in found[records[0].config.agent][0] if "/" not in name and name not in COUNTS]
-    curve_of = score or ("return" if "return" in names else names[0])
+def _compare(entries: list[Entry], parts: int, score: str | None) -> Comparison:
+    config = entries[0].config
+    _require_one_run_a_seed(entries)
+    names = [name for name in entries[0].scores if "/" not in name]
+    curve_of = score or main_score(names)
     if curve_of not in names:
         raise UserError(f"{config.task} has no score {curve_of!r}; {did_you_mean(curve_of, names)}")
+    by_agent = {entry.config.agent: entry for entry in entries}
+    spread = mean_and_standard_error
     return Comparison(
         task=config.task,
         preset=config.preset,
         steps=config.total_steps,
-        seeds={agent: len(runs) for agent, runs in by_agent.items()},
-        scores={agent: {name: spread(run[name] for run in runs) for name in names} for agent, runs in found.items()},
-        minutes={agent: spread(record.wall_seconds / 60 for record in runs) for agent, runs in by_agent.items()},
+        seeds={agent: len(entry.seeds) for agent, entry in by_agent.items()},
+        scores={agent: {name: spread(entry.scores[name]) for name in names} for agent, entry in by_agent.items()},
+        minutes={agent: spread(entry.minutes) for agent, entry in by_agent.items()},
         curve_of=curve_of,
-        curve={
-            agent: [spread(run[i][curve_of] for run in runs) for i in range(parts)] for agent, runs in pieces.items()
-        },
+        curve={agent: [spread(part) for part in entry.curve(curve_of, parts)] for agent, entry in by_agent.items()},
     )
 
 
-def _place(ids: list[str], agent: str) -> int:
-    return ids.index(agent) if agent in ids else len(ids)
-
-
-def _require_one_run_a_seed(records: list[RunRecord]) -> None:
+def _require_one_run_a_seed(entries: list[Entry]) -> None:
     """Also that all seeds of an agent have the same settings."""
-    seen: dict[tuple[str, int], Path] = {}
-    settings: dict[str, tuple[str, Path]] = {}
-    for record in records:
-        config = record.config
-        if (other := seen.setdefault((config.agent, config.seed), record.folder)) != record.folder:
-            raise UserError(f"{other} and {record.folder} are both seed {config.seed} of {config.agent}: leave one out")
-        digest = dataclasses.replace(config, seed=0).digest()
-        before, folder = settings.setdefault(config.agent, (digest, record.folder))
-        if digest != before:
-            raise UserError(f"{folder} and {record.folder} are of {config.agent}, but with different settings")
-
-
-def spread(values: Iterable[float]) -> Spread:
-    """Mean and standard error over seeds; the error of one seed is nan."""
-    array = np.array(list(values), float)
-    error = array.std(ddof=1) / math.sqrt(len(array)) if len(array) > 1 else math.nan
-    return float(array.mean()), float(error)
+    first: dict[str, Entry] = {}
+    for entry in entries:
+        agent, folders = entry.config.agent, [record.folder for record in entry.records]
+        if (other := first.setdefault(agent, entry)) is not entry:
+            raise UserError(f"{folders[0]} and {other.records[0].folder} are of {agent}, but with different settings")
+        for i, seed in enumerate(entry.seeds[1:], 1):
+            if seed == entry.seeds[i - 1]:
+                raise UserError(f"{folders[i - 1]} and {folders[i]} are both seed {seed} of {agent}: leave one out")
 
 
 def tables(comparison: Comparison) -> list[pd.DataFrame]:

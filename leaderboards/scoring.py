@@ -5,7 +5,7 @@ Units are in the names: `percent` is 0 to 100.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -118,3 +118,9 @@ def _final(
     steps = config.protocol.steps
     episodes = episodes[episodes["step"] <= steps]
     return episodes, episodes[episodes["step"] > steps * (1 - config.protocol.final_fraction)]
+
+
+def main_score(names: Iterable[str]) -> str:
+    """Which of a task's scores curves and orders are of: `return` in the game's own units, or the first there is."""
+    names = list(names)
+    return "return" if "return" in names else names[0]

@@ -28,3 +28,16 @@ def drop_compiled_programs():
     """Hundreds of compiled programs in one process exhaust it."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def suite(capsys):
+    """Runs a command: its exit code, stdout and stderr."""
+
+    from suite import cli
+
+    def command(*words):
+        code = cli.main(list(map(str, words)))
+        return code, *capsys.readouterr()
+
+    return command

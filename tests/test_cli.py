@@ -28,17 +28,6 @@ def elsewhere(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def suite(capsys):
-    """Runs a command: its exit code, stdout and stderr."""
-
-    def command(*words):
-        code = cli.main(list(map(str, words)))
-        return code, *capsys.readouterr()
-
-    return command
-
-
-@pytest.fixture
 def never(monkeypatch):
     """Fails when a command gets as far as to start something."""
 

@@ -22,9 +22,10 @@ def execute(args: argparse.Namespace) -> int:
     if args.parts < 1:
         raise UserError(f"--parts={args.parts}: must be at least 1")
 
-    from leaderboards.compare import compare, records_in, tables
+    from leaderboards.compare import compare, tables
+    from leaderboards.results import finished_in
 
-    comparisons = compare(records_in(args.folders), args.parts, args.score)
+    comparisons = compare(finished_in(args.folders), args.parts, args.score)
     for found in comparisons:
         print(f"{found.task}, preset {found.preset}, {found.steps:,} steps\n")
         for table in tables(found):

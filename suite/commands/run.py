@@ -97,7 +97,7 @@ def _result_fields(seed: int, result: Result) -> dict[str, Any]:
 
 def _summary(results: Sequence[Result]) -> dict[str, tuple[float, float]]:
     """Mean and standard error of each score; nan where they say nothing."""
-    from leaderboards.compare import spread
+    from leaderboards.statistics import mean_and_standard_error
 
     names = [name for name in (results[0].scores if results else ()) if "/" not in name]
-    return {name: spread(result.scores[name] for result in results) for name in names}
+    return {name: mean_and_standard_error(result.scores[name] for result in results) for name in names}

@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from leaderboards.compare import compare, records_in, tables
+from leaderboards.compare import compare, tables
+from leaderboards.results import finished_in
 from suite import cli
 from suite.errors import UserError
 from suite.record import RunRecord, run_folder
@@ -38,7 +39,7 @@ def test_means_and_errors_over_seeds(write, tmp_path):
     write("m5", 1, (2, 22))
     write("random", 0, (0, 0))
     write("mfrl", 0, (0, 5), finish=False)
-    (found,) = compare(records_in([tmp_path]), parts=2)
+    (found,) = compare(finished_in([tmp_path]), parts=2)
     assert (found.task, found.preset, found.steps) == ("craftax_classic", "smoke", 64)
     assert found.seeds == {"random": 1, "m5": 2}  # in the order of the registry; the unfinished run is left out
     # 50 % and 100 % in the last tenth: 75, and a deviation of 25 sqrt(2) over sqrt(2) seeds.
@@ -64,28 +65,28 @@ def test_the_command_prints_markdown(write, tmp_path, capsys):
 def test_protocols_are_kept_apart(write, tmp_path):
     write("m5", 0, (0, 11))
     write("m5", 0, (0, 11), overrides=["protocol.final_fraction=0.5"], out="other")
-    assert len(compare(records_in([tmp_path]))) == 2
+    assert len(compare(finished_in([tmp_path]))) == 2
 
 
 def test_what_cannot_be_compared(write, tmp_path):
     with pytest.raises(UserError, match=f"no finished run in {tmp_path}$"):
-        records_in([tmp_path])
+        finished_in([tmp_path])
     write("m5", 0, (0, 11), finish=False)
     with pytest.raises(UserError, match=r"no finished run in .*; 1 unfinished"):
-        records_in([tmp_path])
+        finished_in([tmp_path])
     write("mfrl", 0, (0, 11))
     with pytest.raises(UserError, match="craftax_classic has no score 'rewards'"):
-        compare(records_in([tmp_path]), score="rewards")
+        compare(finished_in([tmp_path]), score="rewards")
     write("mfrl", 0, (0, 11), out="other")
     with pytest.raises(UserError, match="are both seed 0 of mfrl: leave one out"):
-        compare(records_in([tmp_path]))
+        compare(finished_in([tmp_path]))
 
 
 def test_seeds_of_different_settings_are_refused(write, tmp_path):
     write("mfrl", 0, (0, 11))
     write("mfrl", 1, (0, 11), overrides=["ppo.discount=0.5"])
     with pytest.raises(UserError, match="are of mfrl, but with different settings"):
-        compare(records_in([tmp_path]))
+        compare(finished_in([tmp_path]))
 
 
 def test_numbers_are_written_with_their_error():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import math
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -11,6 +13,7 @@ import pytest
 from leaderboards import scoring
 from leaderboards.best_response import Reference
 from suite.config import Config, EnvironmentConfig, PPOConfig, ProtocolConfig, ReplayConfig
+from suite.record import RunRecord
 from tests.tiny import CORRIDOR_SPEC
 
 SPEC = dataclasses.replace(CORRIDOR_SPEC, achievements=("wood", "iron"), achievement_rewards=(1.0, 1.0))
@@ -131,3 +134,31 @@ def test_no_games_are_nan_and_not_an_error(config):
         scores = scoring.games(empty, config, dataclasses.replace(SPEC, id="openspiel/leduc"))
         assert scores["episodes"] == scores["final_episodes"] == 0
         assert all(math.isnan(value) for name, value in scores.items() if "return" in name)
+
+
+def by_hand(path, budget, final_fraction):
+    """Crafter's published formulas on a real `episodes.csv`, with nothing but arithmetic."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = [name for name in rows[0] if name.startswith(("collect_", "place_", "make_", "defeat_", "eat_", "wake_"))]
+    success = {name: 100 * math.fsum(float(row[name]) for row in rows) / len(rows) for name in names}
+    score = math.exp(math.fsum(math.log(1 + percent) for percent in success.values()) / len(success)) - 1
+    last = [row for row in rows if float(row["step"]) > budget * (1 - final_fraction)]
+    unlocked = math.fsum(sum(float(row[name]) for name in names) for row in last) / len(last)
+    returned = math.fsum(float(row["return"]) for row in last) / len(last)
+    rewards = 100 * unlocked / len(names), 100 * returned / len(names)
+    return dict(zip(("reward_percent", "reward_percent_with_health"), rewards, strict=True)), score, success
+
+
+@pytest.mark.parametrize("agent", ["random", "mfrl", "m5"])
+def test_real_records_by_hand(agent):
+    folder = Path(__file__).parents[2] / "leaderboards/evidence/craftax_classic" / agent / "small/seed_0"
+    record = RunRecord.open(folder, lock=False)
+    found = scoring.craftax(record.episodes(), record.config, record.spec)
+    rewards, score, success = by_hand(folder / "episodes.csv", 40_960, 0.2)
+    assert len(success) == 22
+    for name, value in rewards.items():
+        assert found[name] == pytest.approx(value, rel=1e-9)
+    assert found["score_percent"] == pytest.approx(score, rel=1e-9)
+    for name, percent in success.items():
+        assert found[f"success_percent/{name}"] == pytest.approx(percent, rel=1e-9)

@@ -1,0 +1,1 @@
+"""The page of the leaderboards: one HTML file that needs no server and no network."""

@@ -1,0 +1,38 @@
+"use strict";
+
+// A cell's number is in data-value; text sorts as text. What is empty stays last in both directions.
+function compare(a, b, direction) {
+  if (a === "" || b === "") return (a === "") - (b === "");
+  const [x, y] = [Number(a), Number(b)];
+  const order = Number.isNaN(x) || Number.isNaN(y) ? a.localeCompare(b) : x - y;
+  return direction === "ascending" ? order : -order;
+}
+
+const valueOf = (row, index) => row.cells[index].dataset.value ?? row.cells[index].textContent.trim();
+
+for (const table of document.querySelectorAll("table")) {
+  table.tHead.addEventListener("click", (event) => {
+    const header = event.target.closest("button")?.parentElement;
+    if (!header) return;
+    // Numbers are first asked for from the best down, ranks and words from the first up.
+    const first = header.classList.contains("number") && header.cellIndex > 0 ? "descending" : "ascending";
+    const other = first === "ascending" ? "descending" : "ascending";
+    const direction = header.getAttribute("aria-sort") === first ? other : first;
+    for (const cell of table.tHead.rows[0].cells) cell.removeAttribute("aria-sort");
+    header.setAttribute("aria-sort", direction);
+    const body = table.tBodies[0];
+    const rows = [...body.rows];
+    rows.sort((a, b) => compare(valueOf(a, header.cellIndex), valueOf(b, header.cellIndex), direction));
+    body.append(...rows);
+  });
+}
+
+const filters = document.querySelector(".filters");
+filters.addEventListener("submit", (event) => event.preventDefault());
+filters.addEventListener("change", () => {
+  const wanted = [...new FormData(filters)].filter(([, value]) => value !== "");
+  const rows = [...document.querySelectorAll("tbody tr")];
+  for (const row of rows) row.hidden = wanted.some(([name, value]) => row.dataset[name] !== value);
+  const shown = rows.filter((row) => !row.hidden).length;
+  filters.querySelector("output").textContent = wanted.length ? `${shown} of ${rows.length} rows` : "";
+});

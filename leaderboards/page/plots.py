@@ -1,0 +1,180 @@
+"""Figures of the page as SVG, drawn by matplotlib.
+
+Colours are CSS variables (`--ink`, `--grid`, `--series-0` to `--series-7`), so that the page's style, light or dark, is
+theirs. Agents are told apart by dashes and markers as well.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
+
+from leaderboards import statistics
+from leaderboards.results import Entry
+from suite import registry
+
+INK, GRID = "#010203", "#030201"  # stand-ins that no figure has by itself
+SERIES = tuple(f"#0a0b{i:02x}" for i in range(8))
+VARIABLES = {INK: "var(--ink)", GRID: "var(--grid)"} | {color: f"var(--series-{i})" for i, color in enumerate(SERIES)}
+MOST = ("random", "mfrl", "m1", "m2", "m3", "m4", "m5", "m5_slow")  # each with a colour of its own
+DASHES = ("-", (0, (5, 2)), (0, (1, 1.5)))
+MARKERS = "osD^vPX*"
+WIDTH, HEIGHT = 5.6, 3.6  # inches of 72 points: text keeps its size on a phone
+STYLE: Any = {
+    "svg.fonttype": "none",  # text stays text
+    "svg.hashsalt": "suite",  # the same figure is the same bytes
+    "font.family": "sans-serif",
+    "font.size": 11,
+    "text.color": INK,
+    "axes.edgecolor": GRID,
+    "axes.labelcolor": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.5,
+    "legend.frameon": False,
+    "legend.fontsize": 10,
+}
+
+
+def learning_curves(entries: Sequence[Entry], score: str, parts: int, label: str) -> str:
+    """A score against steps: mean over seeds, and its 95 % bootstrap interval where there are several seeds."""
+    steps = entries[0].config.protocol.steps
+    at = (np.arange(parts) + 1) * steps / parts
+    with _figure() as (figure, axes):
+        for entry in entries:
+            mean_P, low_P, high_P = statistics.sample_efficiency_curve(entry.curve(score, parts))
+            color, dashes, _ = style_of(entry.config.agent)
+            axes.plot(at, mean_P, color=color, linestyle=dashes, label=entry.config.agent)
+            axes.fill_between(at, low_P, high_P, color=color, alpha=0.18, linewidth=0)
+        axes.set(xlabel="real environment steps", ylabel=label, xlim=(0, steps))
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k")
+        _legend(axes)
+        return _svg(figure, f"Learning curves: {label} against real environment steps")
+
+
+def achievement_bars(entries: Sequence[Entry]) -> str:
+    """The percentage of training episodes that unlocked each achievement; those that nobody unlocked are left out."""
+    names = [name for name in entries[0].spec.achievements if _success(entries, name).any()]
+    names.sort(key=lambda name: _success(entries, name).max())
+    with _figure(height=0.9 + len(names) * (0.13 + 0.075 * len(entries))) as (figure, axes):
+        thickness = 0.8 / len(entries)
+        for i, entry in enumerate(entries):
+            values = [entry.scores[f"success_percent/{name}"].mean() for name in names]
+            at = np.arange(len(names)) + 0.4 - (i + 0.5) * thickness
+            axes.barh(at, values, height=thickness, color=style_of(entry.config.agent)[0], label=entry.config.agent)
+        axes.set_yticks(np.arange(len(names)), [name.replace("_", " ") for name in names])
+        axes.set(xlabel="episodes that unlocked it, %", xlim=(0, 100), ylim=(-0.6, len(names) - 0.4))
+        axes.grid(False, axis="y")
+        _legend(axes)
+        return _svg(figure, "Bars: percentage of training episodes that unlocked each achievement")
+
+
+def performance_profiles(scores: Mapping[str, Sequence[np.ndarray]], label: str) -> str:
+    """By agent, each task's seeds: the share of runs above each threshold (Agarwal et al. 2021)."""
+    top = max(values.max() for tasks in scores.values() for values in tasks)
+    thresholds = np.linspace(0, 1.05 * top, 101)
+    with _figure() as (figure, axes):
+        for agent, tasks in scores.items():
+            share = np.mean([statistics.performance_profile(values, thresholds) for values in tasks], axis=0)
+            color, dashes, _ = style_of(agent)
+            axes.plot(thresholds, share, color=color, linestyle=dashes, label=agent, drawstyle="steps-post")
+        axes.set(xlabel=label, ylabel="share of runs above", ylim=(0, 1.03), xlim=(0, thresholds[-1]))
+        _legend(axes)
+        return _svg(figure, f"Performance profiles: share of runs whose {label} is above a threshold")
+
+
+def time_against_score(points: Sequence[tuple[str, str, float, float]], label: str) -> str:
+    """Each (method, agent id or "" if published, minutes, score): ours filled, published hollow."""
+    points = sorted(points, key=lambda point: point[3])
+    with _figure(height=max(HEIGHT, 0.9 + 0.19 * len(points))) as (figure, axes):
+        axes.set(xscale="log", xlabel="minutes of one run, wall-clock", ylabel=label)
+        for _, agent, minutes, score in points:
+            color, _, marker = style_of(agent) if agent else (INK, "-", "o")
+            axes.plot(minutes, score, marker, color=color, fillstyle="full" if agent else "none", markersize=6)
+        axes.margins(x=0.12, y=0.06)
+        axes.xaxis.set_major_locator(LogLocator(numticks=5))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:,g}")
+        low, high = axes.get_ylim()
+        heights = [(score - low) / (high - low) for *_, score in points]
+        for (method, _, minutes, score), height in zip(points, _apart(heights, 1 / (len(points) + 1)), strict=True):
+            axes.annotate(
+                f"{method[:32]}\N{HORIZONTAL ELLIPSIS}" if len(method) > 33 else method,
+                (minutes, score),
+                (1.03, height),
+                textcoords="axes fraction",
+                fontsize=9,
+                verticalalignment="center",
+                arrowprops={"arrowstyle": "-", "color": GRID, "linewidth": 0.6, "shrinkB": 4},
+            )
+        return _svg(figure, f"Scatter: {label} against minutes of one run")
+
+
+def _apart(heights: Sequence[float], gap: float) -> list[float]:
+    """Ascending heights from 0 to 1, moved as little as it takes to have them `gap` apart: upwards, then back down."""
+    placed: list[float] = []
+    for height in heights:
+        placed.append(max(height, placed[-1] + gap) if placed else height)
+    ceiling = 1.0
+    for i in reversed(range(len(placed))):
+        placed[i] = min(placed[i], ceiling)
+        ceiling = placed[i] - gap
+    return placed
+
+
+@functools.cache
+def style_of(agent: str) -> tuple[str, object, str]:
+    """Colour, dashes and marker, the same in every figure."""
+    ids = [*MOST, *(id for id in registry.agents() if id not in MOST)]
+    i = ids.index(agent) if agent in ids else len(ids)
+    return SERIES[i % len(SERIES)], DASHES[i % len(DASHES)], MARKERS[i % len(MARKERS)]
+
+
+def _success(entries: Sequence[Entry], name: str) -> np.ndarray:
+    return np.array([entry.scores[f"success_percent/{name}"].mean() for entry in entries])
+
+
+@contextmanager
+def _figure(height: float = HEIGHT) -> Iterator[tuple[Figure, Axes]]:
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, height), layout="constrained")
+        FigureCanvasSVG(figure)
+        yield figure, figure.add_subplot()
+
+
+def _legend(axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    axes.figure.legend(handles, labels, loc="outside upper left", ncols=5, handlelength=1.6, columnspacing=1.0)
+
+
+def _svg(figure: Figure, description: str) -> str:
+    """The `<svg>` element, without what belongs to a file of its own."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None, "Format": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
+    text = re.sub(
+        r'<svg [^>]*viewBox="([^"]*)"[^>]*>',
+        rf'<svg viewBox="\1" role="img" aria-label="{description}">',
+        text,
+        count=1,
+    )
+    for color, variable in VARIABLES.items():
+        text = text.replace(color, variable)
+    return text

@@ -1,0 +1,198 @@
+"""`suite publish` and `suite verify`: from run records to leaderboards, and back.
+
+A folder of leaderboards holds `evidence/`, the small files of every run that a row of ours is of, and CSV files made of
+nothing but that evidence and `published.csv`. So publishing twice writes the same bytes, and anyone can check them.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from leaderboards.boards import Standing, as_csv, boards, tables_digest
+from leaderboards.qualification import Refusal, evidence_files, examine, overrides
+from leaderboards.results import Entry, entries_of, run_folders
+from suite.config import Config
+from suite.errors import UserError
+from suite.record import RunRecord, require_writable
+from suite.tables import write_whole
+
+PAGE = "index.html"
+
+
+@dataclasses.dataclass(frozen=True)
+class Publication:
+    """What `publish` did.
+
+    Attributes:
+      entries: everything that the leaderboards now have a row of.
+      added: folders of runs whose evidence is new.
+      refusals: runs that do not qualify.
+      tables: every leaderboard by its file's name.
+    """
+
+    entries: tuple[Entry, ...]
+    added: tuple[Path, ...]
+    refusals: tuple[Refusal, ...]
+    tables: dict[str, pd.DataFrame]
+
+
+def publish(runs: Sequence[Path], out: Path) -> Publication:
+    """Adds the evidence of runs that qualify to that in `out`, and writes all leaderboards anew.
+
+    Everything is computed before anything is written; each file is replaced whole, a record's last.
+
+    Args:
+      runs: folders of runs, or folders above them.
+      out: the folder of the leaderboards.
+
+    Raises:
+      UserError: nothing qualifies, or `out` cannot be written. Nothing was written then.
+    """
+    kept, new = _collect(runs, out)
+    qualified, refusals = _examined(kept, new, out)
+    if not qualified:
+        where = ", ".join(map(str, runs))
+        reasons = " | ".join(map(str, refusals)) or f"no run in {where or out / 'evidence'}"
+        raise UserError(f"nothing to publish: {reasons}")
+    standings = _standings(qualified, out)
+    tables = boards(standings)
+    contents = {name: as_csv(board) for name, board in tables.items()}
+    added = [record for record in qualified if record.folder not in kept]
+    require_writable(out)
+    for record in added:
+        target = out / evidence_path(record.config)
+        require_writable(target)
+        files = evidence_files(record.folder)
+        for name in sorted(files, key=lambda name: name == "record.json"):
+            write_whole(target / name, files[name])
+    for name, content in contents.items():
+        write_whole(out / name, content)
+    return Publication(
+        entries=tuple(standing.entry for standing in standings),
+        added=tuple(record.folder for record in added),
+        refusals=tuple(refusals),
+        tables=tables,
+    )
+
+
+def verify(out: Path) -> list[str]:
+    """Recomputes every leaderboard in a folder from its evidence; returns each difference as one line.
+
+    Raises:
+      UserError: there is no evidence in the folder.
+    """
+    kept, _ = _collect([], out)
+    if not kept:
+        raise UserError(f"no run in {out / 'evidence'}: nothing to verify {out} with")
+    qualified, refusals = _examined(kept, [], out)
+    problems = [f"evidence does not qualify: {refusal}" for refusal in refusals]
+    tables = {name: as_csv(board) for name, board in boards(_standings(qualified, out)).items()}
+    for name, content in tables.items():
+        problems += (f"{name}: {problem}" for problem in _differences(out / name, content))
+    page = out / PAGE
+    if page.exists() and f'content="{tables_digest(tables)}"' not in page.read_text(errors="replace"):
+        problems.append(f"{PAGE}: made from other tables: publish again with --page {out}")
+    others = {path.name for path in out.glob("*.csv")} - tables.keys() - {"published.csv"}
+    return [*problems, *(f"{name}: made from no evidence" for name in sorted(others))]
+
+
+def standings_in(out: Path) -> list[Standing]:
+    """What a folder of leaderboards has evidence of that qualifies."""
+    kept, _ = _collect([], out)
+    return _standings(_examined(kept, [], out)[0], out)
+
+
+def evidence_path(config: Config) -> Path:
+    """Where a run's evidence lies in a folder of leaderboards: as in `runs/`, other settings in a folder beside."""
+    variant = [config.preset]
+    if config.policy.compute_type != "float32":
+        variant.append(config.policy.compute_type)
+    if overrides(config):
+        variant.append(dataclasses.replace(config, seed=0).digest()[:8])
+    return Path("evidence", config.task, config.agent, "-".join(variant), f"seed_{config.seed}")
+
+
+def _collect(runs: Iterable[Path], out: Path) -> tuple[list[Path], list[Path]]:
+    """Folders of runs: those whose evidence is in `out`, and others."""
+    for folder in runs:
+        if not folder.is_dir():
+            raise UserError(f"{folder} is no folder: give a run's folder, or one with runs below it")
+    kept = run_folders([out / "evidence"])
+    inside = {folder.resolve() for folder in kept}
+    return kept, [folder for folder in run_folders(runs) if folder.resolve() not in inside]
+
+
+def _examined(kept: list[Path], new: list[Path], out: Path) -> tuple[list[RunRecord], list[Refusal]]:
+    """What qualifies, one record a seed; what was published before is left out of the new."""
+    records: list[RunRecord] = []
+    refusals: list[Refusal] = []
+    for folder in (*kept, *new):
+        found = examine(folder)
+        if isinstance(found, Refusal):
+            refusals.append(found)
+        else:
+            records.append(found)
+    seen: dict[tuple[str, str], list[RunRecord]] = {}
+    for record in records:
+        seen.setdefault((record.config.digest(), record.fields["protocol_hash"]), []).append(record)
+    qualified = []
+    for same in seen.values():
+        different: list[RunRecord] = []
+        for record in same:
+            if all(evidence_files(record.folder) != evidence_files(other.folder) for other in different):
+                different.append(record)
+        published = [record for record in different if record.folder in kept]
+        chosen = published if published else different
+        if len(chosen) == 1:
+            qualified += chosen
+        refusals += (
+            Refusal(record.folder, (f"duplicate seed {record.config.seed}: {other.folder} is another run of it",))
+            for record in different
+            if [record] != chosen
+            for other in [next(other for other in different if other is not record)]
+        )
+    for record in qualified:  # runs of other versions of a game would take a seed's place
+        target = out / evidence_path(record.config)
+        if record.folder not in kept and target in kept:
+            refusals.append(Refusal(record.folder, (f"{target} holds another run of its name",)))
+    refused = {refusal.folder for refusal in refusals}
+    return [record for record in qualified if record.folder not in refused], refusals
+
+
+def _standings(records: list[RunRecord], out: Path) -> list[Standing]:
+    def path(record: RunRecord) -> Path:
+        inside = record.folder.is_relative_to(out / "evidence")
+        return record.folder.relative_to(out) if inside else evidence_path(record.config)
+
+    return [Standing(entry, tuple(path(record).parent for record in entry.records)) for entry in entries_of(records)]
+
+
+def _differences(path: Path, expected: bytes) -> list[str]:
+    """What a CSV file says otherwise, row by row."""
+    try:
+        found = path.read_bytes()
+    except OSError as error:
+        return [f"cannot be read ({error.strerror})"]
+    if found == expected:
+        return []
+    rows, right = (list(csv.reader(io.StringIO(text.decode(errors="replace")))) for text in (found, expected))
+    if rows[:1] != right[:1]:
+        return ["the columns are not those of this version: publish again"]
+    problems = [] if len(rows) == len(right) else [f"{len(rows) - 1} rows, the evidence gives {len(right) - 1}"]
+    header = right[0]
+    for number, (row, true) in enumerate(zip(rows[1:], right[1:], strict=False), 2):
+        cells = [
+            f"{name} is {cell!r}, the evidence gives {value!r}"
+            for name, cell, value in zip(header, row, true, strict=False)
+            if cell != value
+        ]
+        if cells or len(row) != len(true):
+            method, metric = (true[header.index(name)] for name in ("method", "metric"))
+            problems.append(f"line {number} ({method}, {metric}): {'; '.join(cells) or 'not as many cells'}")
+    return problems or ["other bytes, though the cells are the same: publish again"]

@@ -1,0 +1,187 @@
+"""Which run records may stand on a leaderboard: whole, consistent with themselves, and run as their preset says."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from suite import registry
+from suite.config import Config, hash_of
+from suite.errors import UserError
+from suite.overrides import dotted
+from suite.record import RunRecord, protocol
+
+# What a result may differ in without being another agent's: when it is saved and evaluated, and what numbers the
+# device computes in, which "auto" decides (`suite.registry`).
+FREE = ("checkpoint.", "evaluation.", "seed", "policy.compute_type", "world_model.compute_type")
+NOT_RANKED = "smoke"  # a preset for tests
+
+
+@dataclasses.dataclass(frozen=True)
+class Refusal:
+    """A run that does not qualify, and everything that speaks against it."""
+
+    folder: Path
+    reasons: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.folder}: {'; '.join(self.reasons)}"
+
+
+def examine(folder: Path) -> RunRecord | Refusal:
+    """The record in a run's folder if it qualifies, else every reason why not."""
+    try:
+        record = RunRecord.open(folder, lock=False)
+        reasons = tuple(_reasons(record))
+    except UserError as error:
+        reasons = (_short(str(error), folder),)
+    return Refusal(folder, reasons) if reasons else record
+
+
+def overrides(config: Config) -> tuple[str, ...]:
+    """Fields, as "dotted.name=value", in which a run differs from its preset as it is today."""
+    preset = dotted(registry.resolve(config.task, config.agent, config.preset))
+    return tuple(
+        f"{name}={json.dumps(value, separators=(',', ':'))}"
+        for name, value in dotted(config).items()
+        if value != preset[name] and not name.startswith(FREE)
+    )
+
+
+def _short(message: str, folder: Path) -> str:
+    """Without the folder's name, which stands before it anyway."""
+    return message.replace(f"{folder}/", "").removeprefix(f"{folder} ")
+
+
+def _reasons(record: RunRecord) -> Iterator[str]:
+    config, fields = record.config, record.fields
+    if config.preset == NOT_RANKED:
+        yield f"preset {config.preset} is for tests"
+    if not record.finished:
+        yield f"unfinished ({fields['status']}): {record.steps:,} of {config.protocol.steps:,} steps"
+        return
+    for name in ("task", "agent", "preset", "seed"):
+        if fields.get(name) != getattr(config, name):
+            yield f"record.json says {name}={fields.get(name)}, config.json {getattr(config, name)}"
+    if fields.get("config_digest") != _stored_digest(record.folder):
+        yield f"config.json is not the configuration that was run ({fields.get('config_digest')})"
+    if str(fields.get("git_commit")).endswith("-dirty"):
+        yield f"made by changed code ({fields['git_commit']}): commit it first, then run"
+    yield from _protocol_reasons(record)
+    yield from _episode_reasons(record)
+
+
+def _stored_digest(folder: Path) -> str:
+    """`Config.digest` of the file as it was written: later versions may have fields more."""
+    stored = json.loads((folder / "config.json").read_text())
+    return hash_of({name: value for name, value in stored.items() if name not in ("checkpoint", "evaluation")})
+
+
+def _protocol_reasons(record: RunRecord) -> Iterator[str]:
+    """The rules in the record must be those of its configuration, and those of its preset."""
+    config, rules = record.config, record.fields["protocol"]
+    if record.fields.get("protocol_hash") != hash_of(rules):
+        yield "protocol_hash is not that of the protocol"
+    ours = protocol(config, record.spec)
+    preset = protocol(registry.resolve(config.task, config.agent, config.preset), record.spec)
+    for name in preset.keys() | rules.keys():
+        if name == "package_version":  # other versions are ranked apart, not refused
+            continue
+        if rules.get(name) != ours.get(name):
+            yield f"another protocol: record.json has {name}={rules.get(name)}, config.json {ours.get(name)}"
+        elif rules.get(name) != preset.get(name):
+            yield f"another protocol: {name}={rules.get(name)}, preset {config.preset} has {preset.get(name)}"
+    # Iterations are whole, and of a game's events not all count: the budget is used up when no iteration fits any more.
+    steps, budget = record.steps, config.protocol.steps
+    if not budget - config.steps_per_iteration < steps <= budget:
+        yield f"took {steps:,} steps, not the {budget:,} of its budget"
+
+
+def _episode_reasons(record: RunRecord) -> Iterator[str]:
+    """Every episode must be possible, and all of them must agree with what each iteration reported."""
+    episodes = record.episodes()
+    columns = record.fields["columns"]["episodes"]
+    if list(episodes) != columns:
+        yield f"episodes.csv has columns {', '.join(map(str, episodes))}, not {', '.join(columns)}"
+        return
+    if episodes.empty:
+        yield "episodes.csv holds no episode"
+        return
+    if problem := _not_finite(episodes):
+        yield f"episodes.csv {problem}"
+        return
+    steps = episodes["step"].to_numpy()
+    if (np.diff(steps) < 0).any() or steps[0] < 1 or steps[-1] > record.steps:
+        yield f"episodes.csv has steps out of order, or outside 1 to {record.steps:,}"
+    if (episodes["length"] < 1).any():
+        yield "episodes.csv has episodes of no length"
+    spec = record.spec
+    if spec.achievements:
+        unlocked = episodes[list(spec.achievements)]
+        if not unlocked.isin([0, 1]).all(axis=None):
+            yield "episodes.csv has achievements that are neither 0 nor 1"
+        elif not np.allclose(unlocked @ np.array(spec.achievement_rewards), episodes["achievement_return"], rtol=1e-5):
+            yield "episodes.csv has an achievement_return that is not the sum of its achievements"
+    yield from _iteration_reasons(record, episodes)
+    scores = registry.task(record.config.task).scores()(episodes, record.config, spec)
+    if missing := [name for name, value in scores.items() if not math.isfinite(value)]:
+        yield f"no episode counts for {', '.join(missing)}"
+
+
+def _iteration_reasons(record: RunRecord, episodes: pd.DataFrame) -> Iterator[str]:
+    """metrics.csv says of each iteration how many episodes ended, and their mean return: recomputed."""
+    metrics = read_table(record.folder / "metrics.csv")
+    if missing := {"step", "episodes", "return"} - set(metrics):
+        yield f"metrics.csv lacks {', '.join(sorted(missing))}"
+        return
+    if problem := _not_finite(metrics[["step", "episodes"]]):
+        yield f"metrics.csv {problem}"
+        return
+    if metrics["step"].iloc[-1] != record.steps:
+        yield f"metrics.csv ends at step {metrics['step'].iloc[-1]:,}, the record at {record.steps:,}"
+    ends = metrics["episodes"].cumsum().to_numpy().astype(int)
+    if ends[-1] != len(episodes):
+        yield f"episodes.csv has {len(episodes):,} episodes, metrics.csv counted {ends[-1]:,}"
+        return
+    pieces = np.split(episodes["return"].to_numpy(float), ends[:-1])
+    for step, piece, reported in zip(metrics["step"], pieces, metrics["return"], strict=True):
+        if len(piece) and not math.isclose(piece.mean(), reported, rel_tol=1e-4, abs_tol=1e-4):  # float32 means
+            yield f"episodes to step {step:,} return {piece.mean():.6g} in episodes.csv, {reported:.6g} in metrics.csv"
+            return
+
+
+def _not_finite(table: pd.DataFrame) -> str:
+    """What is no finite number, and where; "" if all is."""
+    for name in table:
+        numbers = pd.to_numeric(table[name], errors="coerce").to_numpy(float)
+        if not np.isfinite(numbers).all():
+            row = int(np.flatnonzero(~np.isfinite(numbers))[0])
+            return f"line {row + 2}: {name} is {table[name].iloc[row]}, not a finite number"
+    return ""
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """A CSV file of a run.
+
+    Raises:
+      UserError: it cannot be read.
+    """
+    try:
+        return pd.read_csv(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"cannot read {path}: {error}") from error
+
+
+def evidence_files(folder: Path) -> dict[str, Any]:
+    """The files of a run's folder that a leaderboard keeps, by name; those that are there."""
+    return {name: path.read_bytes() for name in EVIDENCE if (path := folder / name).is_file()}
+
+
+EVIDENCE = ("config.json", "record.json", "episodes.csv", "evaluations.csv", "metrics.csv", "timing.csv")

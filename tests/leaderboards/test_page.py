@@ -1,0 +1,180 @@
+"""The page of the leaderboards in a real browser: what it shows, sorts and filters; phones; nothing from outside."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from leaderboards.boards import as_csv, boards, tables_digest
+from leaderboards.page import plots
+from leaderboards.page.page import write_page
+from leaderboards.publish import standings_in
+from leaderboards.results import Entry
+
+REPOSITORY = Path(__file__).parents[2]
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+SHOWN = ("craftax_classic", "minatar/breakout")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The page of a part of what is committed, and what it was made from."""
+    standings = [s for s in standings_in(REPOSITORY / "leaderboards") if s.entry.config.task in SHOWN]
+    tables = boards(standings)
+    folder = tmp_path_factory.mktemp("page")
+    return write_page([s.entry for s in standings], tables, folder), tables, standings
+
+
+def test_it_holds_all_that_it_needs(made):
+    path, tables, _ = made
+    html = path.read_text()
+    assert not re.findall(r'(?:src|href)="(?!#)[^"]*"|url\((?!#)|@import', html)
+    ids = re.findall(r'\bid="([^"]*)"', html)
+    assert len(ids) == len(set(ids)) > 100
+    used = set(re.findall(r'(?:href="|url\()#([^")]*)', html))
+    assert used <= set(ids)
+    assert tables_digest({name: as_csv(table) for name, table in tables.items()}) in html
+    assert not any(color in html for color in plots.VARIABLES)  # each stand-in became the page's own colour
+
+
+def test_the_same_runs_make_the_same_page(made, tmp_path):
+    path, _, standings = made
+    again = write_page([Entry(s.entry.records) for s in standings], boards(standings), tmp_path)
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_markup_in_a_cell_is_shown_as_text(made, tmp_path):
+    _, tables, _ = made
+    table = tables["minatar_breakout.csv"].copy()
+    table["method"] = "<script>alert(1)</script>"
+    html = write_page([], {"minatar_breakout.csv": table}, tmp_path).read_text()
+    assert "<script>alert" not in html and "&lt;script&gt;alert(1)" in html
+
+
+@pytest.fixture(scope="module")
+def browser():
+    sync_api = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium (Debian: chromium)")
+    with sync_api.sync_playwright() as playwright:
+        yield playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+
+
+@pytest.fixture
+def opened(browser, made):
+    """Opens the page in a window of some size; afterwards nothing may have been complained of or asked for."""
+    complaints: list[str] = []
+    pages = []
+
+    def opened(width=1280, scheme="light"):
+        page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda request: request.url.startswith("file:") or complaints.append(request.url))
+        page.goto(made[0].as_uri())
+        pages.append(page)
+        return page
+
+    yield opened
+    for page in pages:
+        page.close()
+    assert complaints == []
+
+
+def column(page, task, heading):
+    """The shown cells of a column, as text."""
+    return page.evaluate(
+        """([task, heading]) => {
+            const table = document.querySelector(`#${task} table`);
+            const index = [...table.tHead.rows[0].cells].findIndex((cell) => cell.textContent.trim() === heading);
+            const rows = [...table.tBodies[0].rows].filter((row) => !row.hidden);
+            return rows.map((row) => row.cells[index].innerText.trim());
+        }""",
+        [task, heading],
+    )
+
+
+def test_a_table_shows_what_its_csv_file_says(opened, made):
+    _, tables, _ = made
+    page = opened()
+    table = tables["craftax_classic.csv"]
+    rewards = table[table["metric"] == "reward_percent"]
+    shown = [text for text in column(page, "craftax_classic", "Reward, % of the maximum") if text]
+    assert [float(text.split()[0]) for text in shown] == [round(float(value), 2) for value in rewards["value"]]
+    origins = column(page, "craftax_classic", "From")
+    assert origins.count("measured") == rewards["measured_here"].sum() and "published" in origins
+
+
+def test_sorting(opened):
+    page = opened()
+    heading = page.get_by_role("region", name="Table of Craftax-classic").get_by_role("columnheader", name="Reward, %")
+
+    def rewards():
+        return [float(text.split()[0]) for text in column(page, "craftax_classic", "Reward, % of the maximum") if text]
+
+    before = rewards()
+    heading.get_by_role("button").click()
+    assert heading.get_attribute("aria-sort") == "descending"
+    assert rewards() == sorted(before, reverse=True) != before
+    heading.get_by_role("button").press("Enter")  # the keyboard sorts as well
+    assert heading.get_attribute("aria-sort") == "ascending" and rewards() == sorted(before)
+    cells = column(page, "craftax_classic", "Reward, % of the maximum")
+    assert cells[-1] == "" and "" not in cells[: len(before)]  # what has no value stays last
+    method = page.get_by_role("region", name="Table of Craftax-classic").get_by_role("columnheader", name="Method")
+    method.get_by_role("button").click()
+    names = column(page, "craftax_classic", "Method")
+    assert names[0].startswith("3-D RoPE") and heading.get_attribute("aria-sort") is None
+
+
+def test_filters_apply_to_all_tables(opened):
+    page = opened()
+    everything = len(column(page, "craftax_classic", "Method"))
+    page.get_by_label("From").select_option("measured here")
+    assert set(column(page, "craftax_classic", "From")) == {"measured"} == set(column(page, "minatar_breakout", "From"))
+    page.get_by_label("From").select_option("all")
+    page.get_by_label("Sees").select_option("symbols")
+    assert column(page, "craftax_classic", "Method") == [] and column(page, "minatar_breakout", "Method")
+    page.get_by_label("Sees").select_option("all")
+    page.get_by_label("Budget").select_option("1,000,000 steps")
+    assert set(column(page, "craftax_classic", "Steps")) == {"1,000,000"}
+    assert re.fullmatch(r"[0-9]+ of [0-9]+ rows", page.locator("output").inner_text())
+    page.get_by_label("Budget").select_option("all")
+    assert len(column(page, "craftax_classic", "Method")) == everything and page.locator("output").inner_text() == ""
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_nothing_runs_over_the_edge(opened, width):
+    page = opened(width)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    figures = "[...document.querySelectorAll('figure svg')]"
+    sizes = page.evaluate(f"{figures}.map((svg) => svg.getBoundingClientRect().width)")
+    assert len(sizes) >= 6 and all(200 < size <= width for size in sizes)
+    texts = f"{figures}.flatMap((svg) => [...svg.querySelectorAll('text')])"
+    heights = page.evaluate(f"{texts}.map((text) => text.getBoundingClientRect().height)")
+    assert min(heights) >= 8  # pixels: still to be read
+
+
+def test_light_and_dark(opened):
+    style = "(name) => getComputedStyle(document.querySelector(name))"
+    script = f"[({style})('body').backgroundColor, ({style})('svg text').fill]"
+    colors = [opened(scheme=scheme).evaluate(script) for scheme in ("light", "dark")]
+    (light, light_ink), (dark, dark_ink) = [[brightness(color) for color in pair] for pair in colors]
+    assert light > 200 > 60 > light_ink and dark < 60 < 200 < dark_ink
+
+
+def brightness(color):
+    return sum(map(int, re.findall(r"[0-9]+", color)[:3])) / 3
+
+
+def test_screen_readers_have_names_for_everything(opened):
+    page = opened()
+    nameless = """[...document.querySelectorAll('table')].filter((table) => !table.caption.textContent.trim()
+        || [...table.tHead.rows[0].cells].some((cell) => cell.scope !== 'col' || !cell.textContent.trim())
+        || [...table.tBodies[0].rows].some((row) => row.querySelectorAll('th[scope=row]').length !== 1)).length"""
+    assert page.evaluate(nameless) == 0
+    assert page.get_by_role("img").count() == page.locator("figure svg[aria-label]").count() >= 6
+    assert page.locator("html[lang=en]").count() == page.locator("main").count() == page.locator("h1").count() == 1
