@@ -16,7 +16,7 @@ from suite import registry
 from suite.config import Config, hash_of
 from suite.errors import UserError
 from suite.overrides import dotted
-from suite.record import RunRecord, protocol
+from suite.record import RunRecord, episode_columns, protocol
 
 # What a result may differ in without being another agent's: when it is saved and evaluated, and what numbers the
 # device computes in, which "auto" decides (`suite.registry`).
@@ -107,7 +107,7 @@ def _protocol_reasons(record: RunRecord) -> Iterator[str]:
 def _episode_reasons(record: RunRecord) -> Iterator[str]:
     """Every episode must be possible, and all of them must agree with what each iteration reported."""
     episodes = record.episodes()
-    columns = record.fields["columns"]["episodes"]
+    columns = episode_columns(record.spec)
     if list(episodes) != columns:
         yield f"episodes.csv has columns {', '.join(map(str, episodes))}, not {', '.join(columns)}"
         return

@@ -106,6 +106,8 @@ def first_problem(error: ValidationError, prefix: str = "") -> str:
     first = error.errors()[0]
     place = prefix + ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "missing":  # the value would be all that is there
+        return f"it lacks {place}"
     if first["type"] == "value_error":  # of the whole: the message names the fields
         return message
     return f"{place}={first['input']!r}: {message[:1].lower()}{message[1:]}"

@@ -34,6 +34,7 @@ from suite import registry
 from suite.config import Config, hash_of
 from suite.errors import RunError, UserError
 from suite.overrides import dotted, first_problem
+from suite.record_schema import SCHEMA, RecordFields
 from suite.surroundings import package_version, peak_memory, surroundings
 from suite.tables import Table, write_whole
 
@@ -42,10 +43,7 @@ if TYPE_CHECKING:
 
     from suite.interface.environment import EnvironmentSpec
 
-SCHEMA = 1
 LOCK = "run.lock"
-# Fields without which a record can be neither read nor gone on with.
-NEEDED = frozenset({"protocol", "columns", "status", "steps", "wall_clock_seconds", "peak_memory_bytes", "resumed"})
 
 
 def run_folder(out: Path, config: Config) -> Path:
@@ -103,6 +101,12 @@ def protocol(config: Config, spec: EnvironmentSpec) -> dict[str, Any]:
     }
 
 
+def episode_columns(spec: EnvironmentSpec) -> list[str]:
+    """Of episodes.csv and evaluations.csv."""
+    scalars = [name for name, shape in spec.statistics if shape == ()]
+    return ["step", "return", "length", *scalars, *spec.achievements]
+
+
 class RunRecord:
     """A run's folder, open. At most one process has it open for writing.
 
@@ -139,7 +143,6 @@ class RunRecord:
             lock.close()
             raise UserError(f"{folder} already holds {taken[0].name}; choose another --out")
         rules = protocol(config, spec)
-        scalars = [name for name, shape in spec.statistics if shape == ()]
         fields = {
             "schema": SCHEMA,
             "task": config.task,
@@ -152,8 +155,8 @@ class RunRecord:
             "max_return": spec.max_return,
             "achievements": list(spec.achievements),
             "columns": {
-                "episodes": ["step", "return", "length", *scalars, *spec.achievements],
-                "evaluations": ["step", "return", "length", *scalars, *spec.achievements],
+                "episodes": episode_columns(spec),
+                "evaluations": episode_columns(spec),
                 "metrics": None,  # those of the first row
                 "timing": None,
             },
@@ -381,8 +384,10 @@ def _read_fields(folder: Path) -> dict[str, Any]:
     fields = _read_json(folder, "record.json")
     if fields.get("schema") != SCHEMA:
         raise UserError(f"{folder} has a record of schema {fields.get('schema')}; this version reads {SCHEMA}")
-    if missing := NEEDED - fields.keys():
-        raise UserError(f"{folder}/record.json is damaged: it lacks {', '.join(sorted(missing))}")
+    try:
+        RecordFields.model_validate(fields)
+    except ValidationError as error:
+        raise UserError(f"{folder}/record.json is damaged: {first_problem(error)}") from error
     return fields
 
 

@@ -211,7 +211,7 @@ def test_a_record_of_other_rules_is_refused(tmp_path):
         ("record.json", "\xff", "record.json is damaged"),
         ("record.json", "[]", "record.json is damaged: not an object"),
         ("record.json", '{"schema": 99}', "has a record of schema 99; this version reads 1"),
-        ("record.json", '{"schema": 1}', "record.json is damaged: it lacks columns"),
+        ("record.json", '{"schema": 1}', "record.json is damaged: it lacks task"),
         ("config.json", "", "config.json is damaged"),
         ("config.json", '{"task": "a", "agent": "b", "preset": "c", "x": 1}', "is not of this version: x=1"),
         ("config.json", '{"task": "a", "agent": "b", "preset": "c", "ppo": {"clip": 0}}', "ppo.clip=0"),
@@ -343,3 +343,17 @@ def test_a_record_with_nan_is_damaged(tmp_path):
     path.write_text(path.read_text().replace('"total": 0.0', '"total": NaN'))
     with pytest.raises(UserError, match=r"record.json is damaged: NaN is not a number that JSON has"):
         RunRecord.open(record.folder, lock=False)
+
+
+def test_every_field_of_a_record_must_be_of_its_kind(tmp_path):
+    with create(tmp_path) as record:
+        path = record.folder / "record.json"
+    fields = json.loads(path.read_text())
+    assert len(fields) > 20
+    for name in fields.keys() - {"schema"}:
+        for wrong in (fields | {name: [None]}, {other: value for other, value in fields.items() if other != name}):
+            path.write_text(json.dumps(wrong))
+            with pytest.raises(UserError, match=f"record.json is damaged: .*{name}"):
+                RunRecord.open(record.folder, lock=False)
+    path.write_text(json.dumps(fields))
+    RunRecord.open(record.folder, lock=False)
