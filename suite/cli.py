@@ -19,7 +19,7 @@ from typing import NoReturn
 from suite.compilation import quiet_xla
 from suite.errors import RunError, UserError, did_you_mean, host_errors
 
-COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "compare", "publish", "verify", "bench")
+COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "compare", "sweep", "publish", "verify", "bench")
 BAD_INPUT, FAILED, STOPPED = 2, 1, 130
 
 
