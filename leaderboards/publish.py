@@ -45,21 +45,22 @@ class Publication:
 def publish(runs: Sequence[Path], out: Path) -> Publication:
     """Adds the evidence of runs that qualify to that in `out`, and writes all leaderboards anew.
 
-    Everything is computed before anything is written; each file is replaced whole, a record's last.
+    Everything is computed before anything is written; each file is replaced whole, a record's last. If nothing
+    qualifies, nothing is written.
 
     Args:
       runs: folders of runs, or folders above them.
       out: the folder of the leaderboards.
 
     Raises:
-      UserError: nothing qualifies, or `out` cannot be written. Nothing was written then.
+      UserError: there are no runs, or `out` cannot be written.
     """
     kept, new = _collect(runs, out)
     qualified, refusals = _examined(kept, new, out)
+    if not qualified and not refusals:
+        raise UserError(f"nothing to publish: no run in {', '.join(map(str, runs)) or out / 'evidence'}")
     if not qualified:
-        where = ", ".join(map(str, runs))
-        reasons = " | ".join(map(str, refusals)) or f"no run in {where or out / 'evidence'}"
-        raise UserError(f"nothing to publish: {reasons}")
+        return Publication((), (), tuple(refusals), {})
     standings = _standings(qualified, out)
     tables = boards(standings)
     contents = {name: as_csv(board) for name, board in tables.items()}

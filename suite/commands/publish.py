@@ -29,6 +29,8 @@ def execute(args: argparse.Namespace) -> int:
     found = publish(args.runs or ([RUNS] if RUNS.is_dir() else []), args.out)
     for refusal in found.refusals:
         print(f"refused {refusal}", file=sys.stderr)
+    if not found.entries:
+        raise UserError(f"nothing to publish: none of {len(found.refusals)} runs qualifies")
     runs = sum(len(entry.records) for entry in found.entries)
     print(f"{len(found.added)} runs added, {len(found.refusals)} refused; {runs} runs in {len(found.entries)} entries")
     print(f"{len(found.tables)} tables in {args.out}")

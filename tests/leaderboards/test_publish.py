@@ -127,9 +127,11 @@ def test_a_family_is_scored_on_one_scale(suite):
 
 
 def refused(outcome, *words):
-    """Exit code 2, one line of error, nothing written."""
+    """Exit code 2, a line for each run and one for all, nothing written."""
     code, out, err = outcome
-    assert (code, out) == (2, "") and err.startswith("error: nothing to publish: ") and err.count("\n") == 1
+    *refusals, last = err.splitlines()
+    assert (code, out) == (2, "") and last.startswith("error: nothing to publish: ") and len(refusals) <= 1
+    assert all(line.startswith("refused ") for line in refusals)
     for word in words:
         assert word in err
     assert not Path("leaderboards").exists()
@@ -175,7 +177,7 @@ REFUSALS = {
 @pytest.mark.parametrize(("damage", "reason"), REFUSALS.values(), ids=REFUSALS)
 def test_what_does_not_qualify_is_refused_with_its_reason(suite, damage, reason):
     damage(write())
-    refused(suite("publish"), "runs/minatar/breakout/mfrl/small/seed_0: ", reason)
+    refused(suite("publish"), "refused runs/minatar/breakout/mfrl/small/seed_0: ", reason)
 
 
 def test_other_protocols_are_refused(suite):
@@ -239,7 +241,7 @@ def test_nothing_to_publish(suite, tmp_path):
     Path("runs/record.txt").write_text("{")
     refused(suite("publish"), "no run in runs")
     Path("runs/record.json").write_bytes(bytes(range(256)))
-    refused(suite("publish"), "runs: record.json is damaged")
+    refused(suite("publish"), "refused runs: record.json is damaged", "none of 1 runs qualifies")
     code, _, err = suite("publish", "nowhere")
     assert code == 2 and err == "error: nowhere is no folder: give a run's folder, or one with runs below it\n"
     write(out="good")
