@@ -57,7 +57,7 @@ Rows = list[dict[str, Any]]
 
 @dataclasses.dataclass(frozen=True)
 class Standing:
-    """An entry and where its evidence lies, relative to the folder of the leaderboards, one path a seed."""
+    """An entry and where its runs' evidence lies, relative to the folder of the leaderboards, one path a seed."""
 
     entry: Entry
     paths: tuple[Path, ...]
@@ -125,14 +125,14 @@ def _rows(standing: Standing) -> Rows:
         "observation": _sees(entry),
         "environment": rules["package"],
         "environment_version": rules["package_version"],
-        "protocol": record.fields["protocol_hash"],
+        "protocol": entry.protocol_hash,
         "hardware": _each(_device(member.fields["device"]) for member in entry.records),
         "minutes": float(entry.minutes.mean()),
         "packages": _each(_packages(member.fields) for member in entry.records),
         "git_commit": _each(str(member.fields["git_commit"]) for member in entry.records),
         "measured_here": True,
         "source": SOURCE,
-        "evidence": _each(str(path) for path in standing.paths),
+        "evidence": _each(str(path.parent) for path in standing.paths),
         "evidence_sha256": digest.hexdigest(),
     }
     return [common | {"metric": name} | _estimates([values]) for name, values in entry.scores.items()]

@@ -54,7 +54,7 @@ def compare(records: Sequence[RunRecord], parts: int = 5, score: str | None = No
     """
     groups: dict[tuple[str, str], list[Entry]] = {}
     for entry in entries_of(records):
-        key = (entry.records[0].fields["protocol_hash"], entry.config.preset)
+        key = (entry.protocol_hash, entry.config.preset)
         groups.setdefault(key, []).append(entry)
     return [_compare(group, parts, score) for group in groups.values()]
 

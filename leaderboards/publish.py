@@ -17,7 +17,7 @@ import pandas as pd
 from leaderboards.boards import Standing, as_csv, boards, tables_digest
 from leaderboards.qualification import Refusal, evidence_files, examine, overrides
 from leaderboards.results import Entry, entries_of, run_folders
-from suite.config import Config
+from suite.config import hash_of
 from suite.errors import UserError
 from suite.record import RunRecord, require_writable
 from suite.tables import write_whole
@@ -56,7 +56,7 @@ def publish(runs: Sequence[Path], out: Path) -> Publication:
       UserError: there are no runs, or `out` cannot be written.
     """
     kept, new = _collect(runs, out)
-    qualified, refusals = _examined(kept, new, out)
+    qualified, refusals = _examined(kept, new)
     if not qualified and not refusals:
         raise UserError(f"nothing to publish: no run in {', '.join(map(str, runs)) or out / 'evidence'}")
     if not qualified:
@@ -64,19 +64,19 @@ def publish(runs: Sequence[Path], out: Path) -> Publication:
     standings = _standings(qualified, out)
     tables = boards(standings)
     contents = {name: as_csv(board) for name, board in tables.items()}
-    added = [record for record in qualified if record.folder not in kept]
+    places = [pair for standing in standings for pair in zip(standing.entry.records, standing.paths, strict=True)]
+    added = [(record.folder, out / path) for record, path in places if record.folder not in kept]
     require_writable(out)
-    for record in added:
-        target = out / evidence_path(record.config)
+    for folder, target in added:
         require_writable(target)
-        files = evidence_files(record.folder)
+        files = evidence_files(folder)
         for name in sorted(files, key=lambda name: name == "record.json"):
             write_whole(target / name, files[name])
     for name, content in contents.items():
         write_whole(out / name, content)
     return Publication(
         entries=tuple(standing.entry for standing in standings),
-        added=tuple(record.folder for record in added),
+        added=tuple(folder for folder, _ in added),
         refusals=tuple(refusals),
         tables=tables,
     )
@@ -91,7 +91,7 @@ def verify(out: Path) -> list[str]:
     kept, _ = _collect([], out)
     if not kept:
         raise UserError(f"no run in {out / 'evidence'}: nothing to verify {out} with")
-    qualified, refusals = _examined(kept, [], out)
+    qualified, refusals = _examined(kept, [])
     problems = [f"evidence does not qualify: {refusal}" for refusal in refusals]
     tables = {name: as_csv(board) for name, board in boards(_standings(qualified, out)).items()}
     for name, content in tables.items():
@@ -106,17 +106,7 @@ def verify(out: Path) -> list[str]:
 def standings_in(out: Path) -> list[Standing]:
     """What a folder of leaderboards has evidence of that qualifies."""
     kept, _ = _collect([], out)
-    return _standings(_examined(kept, [], out)[0], out)
-
-
-def evidence_path(config: Config) -> Path:
-    """Where a run's evidence lies in a folder of leaderboards: as in `runs/`, other settings in a folder beside."""
-    variant = [config.preset]
-    if config.policy.compute_type != "float32":
-        variant.append(config.policy.compute_type)
-    if overrides(config):
-        variant.append(dataclasses.replace(config, seed=0).digest()[:8])
-    return Path("evidence", config.task, config.agent, "-".join(variant), f"seed_{config.seed}")
+    return _standings(_examined(kept, [])[0], out)
 
 
 def _collect(runs: Iterable[Path], out: Path) -> tuple[list[Path], list[Path]]:
@@ -129,7 +119,7 @@ def _collect(runs: Iterable[Path], out: Path) -> tuple[list[Path], list[Path]]:
     return kept, [folder for folder in run_folders(runs) if folder.resolve() not in inside]
 
 
-def _examined(kept: list[Path], new: list[Path], out: Path) -> tuple[list[RunRecord], list[Refusal]]:
+def _examined(kept: list[Path], new: list[Path]) -> tuple[list[RunRecord], list[Refusal]]:
     """What qualifies, one record a seed; what was published before is left out of the new."""
     records: list[RunRecord] = []
     refusals: list[Refusal] = []
@@ -158,20 +148,32 @@ def _examined(kept: list[Path], new: list[Path], out: Path) -> tuple[list[RunRec
             if [record] != chosen
             for other in [next(other for other in different if other is not record)]
         )
-    for record in qualified:  # runs of other versions of a game would take a seed's place
-        target = out / evidence_path(record.config)
-        if record.folder not in kept and target in kept:
-            refusals.append(Refusal(record.folder, (f"{target} holds another run of its name",)))
-    refused = {refusal.folder for refusal in refusals}
-    return [record for record in qualified if record.folder not in refused], refusals
+    return qualified, refusals
 
 
 def _standings(records: list[RunRecord], out: Path) -> list[Standing]:
-    def path(record: RunRecord) -> Path:
-        inside = record.folder.is_relative_to(out / "evidence")
-        return record.folder.relative_to(out) if inside else evidence_path(record.config)
+    """Entries, and where their evidence lies or will lie.
 
-    return [Standing(entry, tuple(path(record).parent for record in entry.records)) for entry in entries_of(records)]
+    What is there stays where it is. What comes has folders as in `runs/`, unless fields differ from the preset's or
+    another entry has that folder, e.g. one of another version of the game: then a key is added to the preset.
+    """
+    entries = entries_of(records)
+    paths: dict[Path, Path] = {}
+    owners: dict[Path, Entry] = {}
+    for entry in entries:
+        for record in entry.records:
+            if record.folder.is_relative_to(out / "evidence"):
+                paths[record.folder] = record.folder.relative_to(out)
+                owners.setdefault(paths[record.folder].parent, entry)
+    for entry in entries:
+        config = entry.config
+        home = Path("evidence", config.task, config.agent, config.preset)
+        if overrides(config) or owners.setdefault(home, entry) is not entry:
+            key = {"settings": dataclasses.replace(config, seed=0).digest(), "protocol": entry.protocol_hash}
+            home = home.with_name(f"{config.preset}-{hash_of(key)[:8]}")
+        for record in entry.records:
+            paths.setdefault(record.folder, home / f"seed_{record.config.seed}")
+    return [Standing(entry, tuple(paths[record.folder] for record in entry.records)) for entry in entries]
 
 
 def _differences(path: Path, expected: bytes) -> list[str]:

@@ -34,6 +34,11 @@ class Entry:
         """The first run's; the others' are the same but for the seed."""
         return self.records[0].config
 
+    @property
+    def protocol_hash(self) -> str:
+        """Of the rules that all its runs were made under."""
+        return self.records[0].fields["protocol_hash"]
+
     @functools.cached_property
     def spec(self) -> EnvironmentSpec:
         """The task's."""

@@ -192,7 +192,7 @@ def _figures(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str
     groups: dict[tuple[str, str], list[Entry]] = {}
     for entry in entries:
         if not overrides(entry.config):
-            groups.setdefault((entry.config.preset, entry.records[0].fields["protocol_hash"]), []).append(entry)
+            groups.setdefault((entry.config.preset, entry.protocol_hash), []).append(entry)
     for (preset, _), group in groups.items():
         score = main_score(group[0].scores)
         label = _label(score).lower()

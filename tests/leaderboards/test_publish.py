@@ -204,6 +204,23 @@ def test_other_versions_of_a_game_are_ranked_apart(suite, monkeypatch, tmp_path)
     }
 
 
+def test_the_same_agent_in_two_versions_of_a_game_keeps_both_evidences(suite, monkeypatch):
+    write(returns=(2.0,), out="new")
+    with monkeypatch.context() as older:
+        older.setattr(record, "package_version", lambda package: "1.0.0")
+        write(returns=(1.0,), out="old")
+    assert suite("publish", "new", "old")[1].startswith("2 runs added, 0 refused; 2 runs in 2 entries")
+    assert len(set(board()[lambda table: table["measured_here"]]["evidence"])) == 2
+    before = files()
+    assert suite("verify", "leaderboards")[0] == 0
+    suite("publish", "old", "new")
+    assert files() == before
+    shutil.rmtree("leaderboards")
+    for folder in ("old", "new"):  # one after the other likewise
+        assert suite("publish", folder)[1].startswith("1 runs added, 0 refused")
+    assert suite("verify", "leaderboards")[0] == 0
+
+
 def test_a_seed_that_was_run_twice_is_refused(suite):
     write("random", returns=(0.5,))
     write(returns=(1.0,), out="a")
