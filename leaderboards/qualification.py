@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,6 +20,8 @@ from suite.record import RunRecord, episode_columns, protocol
 # What a result may differ in without being another agent's: when it is saved and evaluated, and what numbers the
 # device computes in, which "auto" decides (`suite.registry`).
 FREE = ("checkpoint.", "evaluation.", "seed", "policy.compute_type", "world_model.compute_type")
+# What a leaderboard keeps of a run's folder.
+EVIDENCE = ("config.json", "record.json", "episodes.csv", "evaluations.csv", "metrics.csv", "timing.csv")
 NOT_RANKED = "smoke"  # a preset for tests
 
 
@@ -137,7 +138,7 @@ def _episode_reasons(record: RunRecord) -> Iterator[str]:
 
 def _iteration_reasons(record: RunRecord, episodes: pd.DataFrame) -> Iterator[str]:
     """metrics.csv says of each iteration how many episodes ended, and their mean return: recomputed."""
-    metrics = read_table(record.folder / "metrics.csv")
+    metrics = record.table("metrics")
     if missing := {"step", "episodes", "return"} - set(metrics):
         yield f"metrics.csv lacks {', '.join(sorted(missing))}"
         return
@@ -167,21 +168,6 @@ def _not_finite(table: pd.DataFrame) -> str:
     return ""
 
 
-def read_table(path: Path) -> pd.DataFrame:
-    """A CSV file of a run.
-
-    Raises:
-      UserError: it cannot be read.
-    """
-    try:
-        return pd.read_csv(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot read {path}: {error}") from error
-
-
-def evidence_files(folder: Path) -> dict[str, Any]:
-    """The files of a run's folder that a leaderboard keeps, by name; those that are there."""
+def evidence_files(folder: Path) -> dict[str, bytes]:
+    """Those of `EVIDENCE` that are in a run's folder, by name."""
     return {name: path.read_bytes() for name in EVIDENCE if (path := folder / name).is_file()}
-
-
-EVIDENCE = ("config.json", "record.json", "episodes.csv", "evaluations.csv", "metrics.csv", "timing.csv")

@@ -323,12 +323,21 @@ class RunRecord:
 
     def episodes(self) -> pd.DataFrame:
         """The training episodes; see `leaderboards.scoring`."""
+        return self.table("episodes")
+
+    def table(self, name: str) -> pd.DataFrame:
+        """One of the CSV files, by its name without the ending.
+
+        Raises:
+          UserError: it cannot be read.
+        """
         import pandas as pd
 
+        path = self.folder / f"{name}.csv"
         try:
-            return pd.read_csv(self.folder / "episodes.csv")
+            return pd.read_csv(path)
         except (OSError, ValueError) as error:
-            raise UserError(f"cannot read {self.folder}/episodes.csv: {error}") from error
+            raise UserError(f"cannot read {path}: {error}") from error
 
     def close(self) -> None:
         """Lets other processes open the folder."""
