@@ -16,11 +16,14 @@ from leaderboards.families import BASELINE, FamilyScores, families
 from leaderboards.published import OF_FAMILY, published
 from leaderboards.qualification import evidence_files, overrides
 from leaderboards.results import Entry
+from suite import registry
 
 COLUMNS = (
     "task",
     "preset",  # "" for what others published
-    "rank",  # within the same preset and protocol; none where fields differ from the preset, or others measured
+    # Within the same preset and protocol; none where fields differ from the preset, others measured, or the agent
+    # learns from the simulator.
+    "rank",
     "method",
     "agent",
     "overrides",
@@ -50,6 +53,7 @@ COLUMNS = (
 )
 OVERALL = "overall.csv"
 SOURCE = "this suite"
+USES_SIMULATOR = "uses the simulator: a bound, not ranked"
 IMPROVEMENT = f"probability_of_improvement_over_{BASELINE}"
 
 Rows = list[dict[str, Any]]
@@ -132,6 +136,7 @@ def _rows(standing: Standing) -> Rows:
         "git_commit": _each(str(member.fields["git_commit"]) for member in entry.records),
         "measured_here": True,
         "source": SOURCE,
+        "note": _note(entry.config.agent),
         "evidence": _each(str(path.parent) for path in standing.paths),
         "evidence_sha256": digest.hexdigest(),
     }
@@ -159,6 +164,7 @@ def _family_rows(group: Sequence[FamilyScores]) -> Rows:
             "minutes": float(sum(entry.minutes.mean() for entry in scores.entries)),
             "measured_here": True,
             "source": SOURCE,
+            "note": _note(scores.agent),
             "evidence": _each(file_name(entry.config.task) for entry in scores.entries),
         }
         kind = {"metric": scores.metric, "error_kind": "standard error"}
@@ -182,6 +188,12 @@ def _estimates(values: Sequence[np.ndarray]) -> dict[str, float]:
     }
 
 
+def _note(agent: str) -> str | None:
+    """What is to be known of an agent beside its scores."""
+    known = registry.agents()
+    return USES_SIMULATOR if agent in known and known[agent].uses_simulator else None
+
+
 def _sees(entry: Entry) -> str:
     return "pixels" if entry.spec.observation.kind == "pixels" else "symbolic"
 
@@ -189,7 +201,7 @@ def _sees(entry: Entry) -> str:
 def _ordered(ours: pd.DataFrame, literature: pd.DataFrame) -> pd.DataFrame:
     """Ranks ours, best first within each group, and puts the published rows after them."""
     group = ["task", "preset", "steps", "environment_version", "protocol", "metric"]
-    ranked = ours[ours["overrides"] == ""]
+    ranked = ours[(ours["overrides"] == "") & (ours["note"] != USES_SIMULATOR)]
     ranks = ranked.groupby(group, dropna=False, sort=False)["value"].rank(method="min", ascending=False)
     ours = ours.assign(rank=ranks.astype("Int64"))
     names = sorted(dict.fromkeys(ours["metric"]), key=lambda name: name == IMPROVEMENT)  # which stands last

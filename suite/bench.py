@@ -116,7 +116,8 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
         replay = measure("remember", agent.remember, replay, (trajectory,), 1, policy_type)
     if config.ppo.learn_from_real:
         learner, _ = measure("learn", agent.learn, learner, (trajectory, jnp.zeros(2, jnp.float32)), 1, policy_type)
-    if replay is not None:
+    world_model, tokenizer = None, None
+    if config.world_model.enabled:
         scale = config.tokenizer.updates / max(1, agent.config.tokenizer.updates)
         arguments: tuple[Any, ...] = (replay, keys[2])
         tokenizer, _ = measure("tokenizer", agent.update_tokenizer, state.tokenizer, arguments, scale, model_type)
@@ -125,8 +126,9 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
         world_model, _ = measure(
             "world_model", agent.update_world_model, state.world_model, arguments, scale, model_type
         )
+    if config.dreams:
         one = jnp.ones((), jnp.int32)
-        arguments = (world_model.params, tokenizer, replay, keys[4], one)
+        arguments = (None if world_model is None else world_model.params, tokenizer, replay, keys[4], one)
         measure("imagine", agent.imagine, learner, arguments, config.imagination.updates, policy_type)
     total = sum(row["ms"] for row in rows)
     for row in rows:
@@ -141,12 +143,13 @@ def _summary(config: Config, agent: Agent, phases: Table) -> dict[str, Any]:
     report: dict[str, Any] = {"environment steps/s while collecting": steps / (ms["collect"] / 1e3)}
     updates = sum(config.imagined_updates((i + 1) * steps) for i in range(config.iterations))
     seconds = config.iterations * sum(value for phase, value in ms.items() if phase != "imagine") / 1e3
-    if config.world_model.enabled:
-        plan, model = config.imagination, config.world_model
+    plan, model = config.imagination, config.world_model
+    if config.dreams:
         imagined = plan.num_envs * plan.horizon
         report["imagined steps/s, learning included"] = imagined * plan.updates / (ms["imagine"] / 1e3)
+        seconds += updates * ms["imagine"] / max(1, plan.updates) / 1e3
+    if model.enabled:
         tokens = model.sequences * model.sequence_length * (agent.tokens.tokens_per_frame + 1) * model.updates
         report["world-model training tokens/s"] = tokens / (ms["world_model"] / 1e3)
-        seconds += updates * ms["imagine"] / max(1, plan.updates) / 1e3
     report["projected hours of the whole run"] = seconds / 3600
     return report

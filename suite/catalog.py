@@ -267,6 +267,23 @@ AGENTS = (
         "Appendix C, annealing",
         "reward 65.71 +- 1.11 %",
     ),
+    AgentEntry("m6", Lazy("baselines.beyond:m6"), "beyond the paper: m5 whose world model copies and looks around"),
+    *(
+        AgentEntry(f"m6_no_{part}", Lazy("baselines.beyond:m6_without", (part,)), f"m6 {without}")
+        for part, without in (
+            ("correspondence", "that makes every token anew"),
+            ("grid", "with positions along the stream, as in m5"),
+            ("local", "that embeds each token alone"),
+            ("action", "whose action is a token and nothing more"),
+            ("min_p", "that dreams improbable tokens too"),
+        )
+    ),
+    AgentEntry(
+        "oracle",
+        Lazy("baselines.beyond:oracle"),
+        "m5 that dreams in the true game: a bound, not ranked",
+        uses_simulator=True,
+    ),
 )
 
 PRESETS = (

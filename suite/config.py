@@ -131,6 +131,14 @@ class WorldModelConfig:
     dropout: Rate = 0.1  # embedding, attention and residual
     initial_std: PositiveFloat = 0.02  # of every kernel and embedding, GPT-2's; narrow models learn faster from more
     positions: Literal["flat", "grid"] = "flat"  # RoPE over the token index, or over (time, row, column): note 20
+    # The next frame's tokens are copied from around their place or made new (`world_model.correspondence`); not the paper's.
+    correspondence: bool = False
+    correspondence_radius: NotNegative = 1  # of the square that is copied from; symbols: their own place alone
+    # Numbers in a further embedding of the 3x3 tokens around each, of which its own embedding gets a sum; 0: none.
+    local_embedding: NotNegative = 0
+    action_in_tokens: bool = False  # an embedding of the action is added to every token of its block
+    pooled_heads: bool = False  # reward, termination and turns are read off all tokens' outputs, not the action's alone
+    product_embedding: NotNegative = 0
     # Symbols are embedded by value and place, since the same value means different things in different places; the
     # paper does not say. false: by value alone, as patches are.
     symbol_places: bool = True
@@ -150,6 +158,15 @@ class WorldModelConfig:
 class ImaginationConfig:
     """Policy updates on imagined play (Algorithm 1, step 4)."""
 
+    # Where dreams happen: in the world model, or in the task's own game, started from replayed states (`oracle`).
+    world: Literal["model", "game"] = "model"
+    # Dreams start among the latest so many steps of each environment. 0: anywhere in the replay buffer.
+    recent: NotNegative = 0
+    # Real frames before the start frame that the world model sees too. The paper's dreams see none (note 24).
+    context: NotNegative = 0
+    # Codes less likely than this share of the likeliest one are not dreamt: what is left of a softmax that training
+    # has not emptied. 0: all are drawn as the model says.
+    min_p: Rate = 0.0
     start_step: NotNegative = 200_000  # T_BP: warmup
     horizon: Positive = 20  # T_WM
     num_envs: Positive = 48
@@ -200,6 +217,11 @@ class Config:
             raise ValueError(problem)
 
     @property
+    def dreams(self) -> bool:
+        """Whether the policy learns from imagined play."""
+        return self.world_model.enabled or self.imagination.world == "game"
+
+    @property
     def steps_per_iteration(self) -> int:
         """Real environment steps of one iteration: N_env x T_env."""
         return self.environment.num_envs * self.environment.rollout_length
@@ -217,7 +239,7 @@ class Config:
     def imagined_updates(self, steps: int) -> int:
         """Imagined policy updates of the iteration that brings the run to `steps` real steps."""
         plan = self.imagination
-        if not self.world_model.enabled or steps < plan.start_step:
+        if not self.dreams or steps < plan.start_step:
             return 0
         if plan.schedule == "linear":
             return round(plan.updates * min(1.0, steps / self.protocol.steps))
@@ -253,7 +275,7 @@ def _problems(config: Config) -> Iterator[str]:
             yield f"{name}={value} must divide {of}={total}"
     if list(model.reward_classes or ()) != sorted(set(model.reward_classes or ())):
         yield f"world_model.reward_classes={model.reward_classes} must ascend"
-    if model.enabled and config.replay.capacity < 2 * config.steps_per_iteration:
+    if config.dreams and config.replay.capacity < 2 * config.steps_per_iteration:
         yield f"replay.capacity={config.replay.capacity} must hold two iterations ({2 * config.steps_per_iteration})"
     if model.enabled and env.rollout_length <= model.sequence_length:
         yield (
@@ -262,15 +284,22 @@ def _problems(config: Config) -> Iterator[str]:
         )
     if env.rollout_length < env.burn_in:
         yield f"environment.rollout_length={env.rollout_length} must be at least environment.burn_in={env.burn_in}"
-    if dream.horizon > model.sequence_length:
+    if dream.world == "game" and model.enabled:
+        yield "imagination.world=game has no use for a world model: world_model.enabled=false"
+    if dream.world == "model" and dream.horizon + dream.context > model.sequence_length:
         yield (
-            f"imagination.horizon={dream.horizon} must not exceed "
+            f"imagination.horizon={dream.horizon} and imagination.context={dream.context} must together not exceed "
             f"world_model.sequence_length={model.sequence_length}, the longest context the model has seen"
         )
     if (model.embed_dim // model.heads) % 2:
         yield f"world_model.embed_dim / world_model.heads = {model.embed_dim / model.heads:g} must be even (RoPE)"
     if config.policy.kind == "moon" and (config.policy.rnn_size or not config.policy.embedding_size):
         yield "policy.kind=moon has no memory and an embedding: policy.rnn_size=0, and policy.embedding_size above 0"
+    if model.correspondence and (not model.block_teacher_forcing or config.tokenizer.kind == "continuous"):
+        yield (
+            "world_model.correspondence=true needs world_model.block_teacher_forcing=true and a tokenizer.kind whose "
+            "tokens are codes"
+        )
     if config.tokenizer.kind == "continuous" and not model.block_teacher_forcing:
         yield "tokenizer.kind=continuous needs world_model.block_teacher_forcing=true: its tokens are no codes"
     if config.protocol.steps < config.steps_per_iteration:

@@ -15,8 +15,9 @@ import jax
 from flax import nnx
 
 from suite.agent.dyna import build_tokenizer
+from suite.agent.replay import Replay
 from suite.config import Config
-from suite.interface.environment import EnvironmentSpec
+from suite.interface.environment import EnvironmentSpec, State
 from suite.overrides import dotted
 from suite.policy.actor_critic import make_policy
 from suite.registry import Source
@@ -82,8 +83,16 @@ class Description:
         }
 
 
-def describe(layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec) -> Description:
-    """Describes the configuration that `suite.registry.layers` made for a task of this specification."""
+def describe(
+    layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec, state: State = None
+) -> Description:
+    """Describes the configuration that `suite.registry.layers` made for a task of this specification.
+
+    Args:
+      layers: the configuration after each source's changes.
+      spec: the task's.
+      state: the shapes of one environment's state, where the replay buffer keeps states.
+    """
     config = layers[-1][1]
     policy = nnx.eval_shape(
         lambda: make_policy(config.policy, spec.observation, spec.num_actions, nnx.Rngs(0)),
@@ -94,7 +103,7 @@ def describe(layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec) -> 
         world_model = nnx.eval_shape(lambda: WorldModel(config.world_model, tokens, grid, nnx.Rngs(0)))
         modules["world_model"] = _layers(world_model)
         modules |= _tokenizer_modules(jax.eval_shape(tokenizer.init, jax.random.key(0)))
-    return Description(_settings(layers), modules, _derived(config, spec))
+    return Description(_settings(layers), modules, _derived(config, spec) + _memory(config, spec, state))
 
 
 def _settings(layers: Sequence[tuple[Source, Config]]) -> list[Setting]:
@@ -129,13 +138,24 @@ def _group(tree: Any) -> list[Layer]:
     return [Layer(name, arrays) for name, arrays in shapes.items()]
 
 
+def _memory(config: Config, spec: EnvironmentSpec, state: State) -> list[tuple[str, int, str]]:
+    """What the replay buffer takes."""
+    if not config.dreams:
+        return []
+    replay = Replay.of(config)
+    arrays = jax.tree.leaves(jax.eval_shape(lambda: replay.init(spec, state)))
+    held = sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays)
+    how = "frames, actions and the rest" + (" and the environments' own states" if state is not None else "")
+    return [("replay memory (MiB)", held // 2**20, f"{how} of {replay.num_envs} x {replay.length} steps")]
+
+
 def _derived(config: Config, spec: EnvironmentSpec) -> list[tuple[str, int, str]]:
     derived = [
         ("steps per iteration", config.steps_per_iteration, "environment.num_envs x environment.rollout_length"),
         ("iterations", config.iterations, "whole ones that fit protocol.steps" + MORE * bool(spec.chance_outcomes)),
         ("real steps", config.total_steps, "iterations x steps per iteration"),
     ]
-    if config.world_model.enabled:
+    if config.dreams:
         steps = [(i + 1) * config.steps_per_iteration for i in range(config.iterations)]
         updates = {step: config.imagined_updates(step) for step in steps}
         dreaming = [step for step, count in updates.items() if count]
@@ -146,6 +166,9 @@ def _derived(config: Config, spec: EnvironmentSpec) -> list[tuple[str, int, str]
             ("iterations with imagination", len(dreaming), "from there to the end"),
             ("imagined policy updates", total, "over all iterations"),
             ("imagined steps", imagined, "updates x imagination.num_envs x imagination.horizon"),
+        ]
+    if config.world_model.enabled:
+        derived += [
             (
                 "world-model gradient steps",
                 config.iterations * config.world_model.updates * config.world_model.minibatches,

@@ -78,6 +78,8 @@ class AgentEntry:
       row: where the paper reports it, "" if nowhere.
       published: reward and score in percent as published for Craftax-classic at 1M steps, "" if there are none.
       millions: of parameters, as published; None if they are not.
+      uses_simulator: it learns from the task's own simulator beyond its budget of real steps, so it is a bound that
+        others are compared with, and takes no rank.
     """
 
     id: str
@@ -86,6 +88,7 @@ class AgentEntry:
     row: str = ""
     published: str = ""
     millions: float | None = None
+    uses_simulator: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -154,13 +154,14 @@ class _Training:
             with self._phase("world_model"):
                 world_model, found = agent.update_world_model(world_model, tokenizer, replay, keys[2])
                 metrics |= self._check("world_model", found)
-            updates = config.imagined_updates(self.steps)
-            if updates:
-                with self._phase("imagine"):
-                    learner, found = agent.imagine(
-                        learner, world_model.params, tokenizer, replay, keys[3], jnp.asarray(updates, jnp.int32)
-                    )
-                    metrics |= self._check("imagine", found)
+        updates = config.imagined_updates(self.steps)
+        if updates:
+            params = None if world_model is None else world_model.params
+            with self._phase("imagine"):
+                learner, found = agent.imagine(
+                    learner, params, tokenizer, replay, keys[3], jnp.asarray(updates, jnp.int32)
+                )
+                metrics |= self._check("imagine", found)
         self.record.append_episodes(rows)
         returns = [row["return"] for row in rows]
         mean_return = float(np.mean(returns)) if returns else None

@@ -142,7 +142,8 @@ def _rows(table: pd.DataFrame, metrics: Sequence[str], overall: bool) -> Iterato
         scores = {row["metric"]: row for row in group.to_dict("records")}
         row = next(iter(scores.values()))
         ours = bool(row["measured_here"])
-        method = Cell(row["method"], row["method"], _text(row["overrides"]))
+        remark = _text(row["note"]) if ours else ""
+        method = Cell(row["method"], row["method"], "; ".join(filter(None, [_text(row["overrides"]), remark])))
         cells = [_number(row["rank"], "{:.0f}"), method]
         cells += [Cell(row["task"], row["task"])] if overall else []
         cells.append(Cell("measured" if ours else "published", badge="ours" if ours else "theirs"))

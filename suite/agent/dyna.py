@@ -15,17 +15,19 @@ import jax.numpy as jnp
 from flax import nnx, struct
 
 from suite.agent import rollout as play
-from suite.agent.replay import Replay, ReplayState
+from suite.agent.replay import Experience, Replay, ReplayState
 from suite.config import Config
+from suite.errors import UserError
 from suite.interface.batching import Batched
-from suite.interface.environment import Environment, EnvironmentSpec
+from suite.interface.environment import BatchedEnvironment, Environment, EnvironmentSpec, State
+from suite.interface.host import HostEnvironment
 from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec, encode_frame
 from suite.interface.turns import stream_action
 from suite.policy import ppo
 from suite.policy.actor_critic import make_policy
 from suite.tokenizers import make_tokenizer
 from suite.world_model import training as world_model_training
-from suite.world_model.imagination import Dream
+from suite.world_model.imagination import Context, Dream
 from suite.world_model.transformer import WorldModel
 
 Metrics = dict[str, jax.Array]
@@ -63,6 +65,7 @@ def build_tokenizer(config: Config, spec: EnvironmentSpec) -> tuple[Tokenizer, T
         player_actions=spec.num_actions if spec.two_player else 0,
         chance_outcomes=spec.chance_outcomes,
         token_size=tokenizer.token_size,
+        spatial=spec.observation.kind != "symbols",
     )
     return tokenizer, tokens, (players * rows, columns)
 
@@ -76,14 +79,24 @@ class Agent:
         Args:
           config: the resolved configuration.
           environment: one pure environment.
+
+        Raises:
+          UserError: it is to be dreamt in, but steps on the host, and so cannot go back to an earlier state.
         """
+        if config.imagination.world == "game" and isinstance(environment, HostEnvironment):
+            raise UserError(
+                f"agent {config.agent} dreams in the game itself, and {config.task} steps on the host, where no dream "
+                "can start from an earlier state; it needs craftax_classic, craftax_full, minatar/* or a game of "
+                "openspiel/* that fits into tables"
+            )
         self.config = config
         self.spec = spec = environment.spec
         self.batched = Batched(environment, config.environment.num_envs)
         self.policy_graph = nnx.graphdef(nnx.eval_shape(lambda: self._new_policy(nnx.Rngs(0))))
         self.policy_optimizer = ppo.make_optimizer(config.ppo)
-        if config.world_model.enabled:
+        if config.dreams:
             self.replay = Replay.of(config)
+        if config.world_model.enabled:
             self.tokenizer, self.tokens, self.grid = build_tokenizer(config, spec)
             self.world_model_optimizer = world_model_training.make_optimizer(config.world_model)
             self.world_model_graph = nnx.graphdef(nnx.eval_shape(lambda: self._new_world_model(nnx.Rngs(0))))
@@ -96,7 +109,8 @@ class Agent:
             phases["learn"] = ppo.METRICS
         if self.config.world_model.enabled:
             phases["tokenizer"] = self.tokenizer.metrics
-            phases["world_model"] = world_model_training.metrics_of(self.tokens)
+            phases["world_model"] = world_model_training.metrics_of(self.tokens, self.config.world_model)
+        if self.config.dreams:
             phases["imagine"] = IMAGINATION_METRICS
         return [f"{phase}/{metric}" for phase, metrics in phases.items() for metric in metrics]
 
@@ -119,18 +133,30 @@ class Agent:
     def _untrained(self, policy_key: jax.Array, tokenizer_key: jax.Array, model_key: jax.Array) -> dict[str, Any]:
         """What a fresh `TrainState` holds besides its player."""
         params = nnx.state(self._new_policy(nnx.Rngs(policy_key)))
-        learner = ppo.Learner.create(self.config.ppo, self.policy_optimizer, params)
+        fresh = {"learner": ppo.Learner.create(self.config.ppo, self.policy_optimizer, params)}
+        if self.config.dreams:
+            fresh["replay"] = self.new_replay()
         if not self.config.world_model.enabled:
-            return {"learner": learner}
+            return fresh
         model_params = nnx.state(self._new_world_model(nnx.Rngs(model_key)))
-        return {
-            "learner": learner,
-            "replay": self.replay.init(self.spec),
+        return fresh | {
             "tokenizer": self.tokenizer.init(tokenizer_key),
             "world_model": world_model_training.WorldModelLearner(
                 params=model_params, optimizer=self.world_model_optimizer.init(model_params)
             ),
         }
+
+    def new_replay(self) -> ReplayState:
+        """An empty replay buffer, with room for the environments' states if dreams happen in the game."""
+        return self.replay.init(self.spec, self.kept_state)
+
+    @property
+    def kept_state(self) -> State:
+        """Shapes of one environment's state, if the replay buffer keeps states; else None."""
+        if self.config.imagination.world != "game":
+            return None
+        state_B, _ = jax.eval_shape(self.batched.reset, jax.random.key(0))
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state_B)
 
     @functools.partial(jax.jit, static_argnums=0)
     def start(self, learner: ppo.Learner, key: jax.Array) -> play.Player:
@@ -144,7 +170,8 @@ class Agent:
         """Step 1: T_env real steps in each of N_env environments."""
         config, policy = self.config.environment, self._policy(learner)
         player = play.refresh(policy, player, carried=config.burn_in_start == "carried")
-        return play.rollout(key, policy, learner.targets, self.batched, player, config.rollout_length)
+        keep = self.config.imagination.world == "game"
+        return play.rollout(key, policy, learner.targets, self.batched, player, config.rollout_length, keep)
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def remember(self, replay: ReplayState, trajectory: ppo.Trajectory) -> ReplayState:
@@ -225,14 +252,17 @@ class Agent:
     def imagine(
         self,
         learner: ppo.Learner,
-        world_model: nnx.State,
-        tokenizer: TokenizerState,
+        world_model: nnx.State | None,
+        tokenizer: TokenizerState | None,
         replay: ReplayState,
         key: jax.Array,
         updates: jax.Array,
     ) -> tuple[ppo.Learner, Metrics]:
-        """Step 4: `updates` times (a traced number, so that annealing never recompiles), dream and learn from it."""
-        model = nnx.merge(self.world_model_graph, world_model)
+        """Step 4: `updates` times (a traced number, so that annealing never recompiles), dream and learn from it.
+
+        An agent that dreams in the true game has neither `world_model` nor `tokenizer`.
+        """
+        model = None if world_model is None else nnx.merge(self.world_model_graph, world_model)
 
         def update(i, carry):
             learner, total = carry
@@ -249,31 +279,55 @@ class Agent:
         return learner, jax.tree.map(lambda x: x / updates.astype(jnp.float32), total)
 
     def dream(
-        self, learner: ppo.Learner, model: WorldModel, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array
+        self,
+        learner: ppo.Learner,
+        model: WorldModel | None,
+        tokenizer: TokenizerState | None,
+        replay: ReplayState,
+        key: jax.Array,
     ) -> ppo.Trajectory:
         """One imagined rollout from replayed frames, the memory refreshed on the M frames before each (note 12)."""
-        plan, policy = self.config.imagination, self._policy(learner)
+        plan, policy, memory = self.config.imagination, self._policy(learner), self.config.environment.burn_in
         sample_key, start_key, rollout_key = jax.random.split(key, 3)
-        past = self.replay.sample(replay, sample_key, plan.num_envs, self.config.environment.burn_in + 1)
+        before = max(memory, plan.context)
+        past = self.replay.sample(replay, sample_key, plan.num_envs, before + 1, plan.recent)
         past = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), past)
-        start_turn_B = jax.tree.map(lambda x: x[-1], past.turn)
-        dream = Dream(
-            model, self.tokenizer, tokenizer, self.spec, self.tokens, plan.horizon, past.observation[-1], start_turn_B
-        )
+        dream = self._dreamt_world(model, tokenizer, past)
         player = play.start(policy, dream, start_key, 0)
         player = dataclasses.replace(
             player,
             time_step=dataclasses.replace(player.time_step, first=past.first[-1]),
             recent=play.Recent(
-                past.observation[:-1],
-                past.first[:-1],
+                past.observation[before - memory : -1],
+                past.first[before - memory : -1],
                 player.hidden_BH,
-                None if past.turn is None else past.turn.ours[:-1],
+                None if past.turn is None else past.turn.ours[before - memory : -1],
             ),
         )
         player = play.refresh(policy, player, carried=False)
         _, trajectory, _ = play.rollout(rollout_key, policy, learner.targets, dream, player, plan.horizon)
         return trajectory
+
+    def _dreamt_world(self, model: WorldModel | None, tokenizer: TokenizerState, past: Experience) -> BatchedEnvironment:
+        """The world model, or the true game, at the last of the replayed steps `past` (time-major)."""
+        plan = self.config.imagination
+        start = jax.tree.map(lambda x: x[-1], past)
+        if model is None:
+            game = Batched(self.batched.environment, plan.num_envs)
+            return game.resumed(start.state, start.observation, start.first, start.turn)
+        context = jax.tree.map(lambda x: x[len(past.first) - 1 - plan.context : -1], past)
+        return Dream(
+            model,
+            self.tokenizer,
+            tokenizer,
+            self.spec,
+            self.tokens,
+            plan.horizon,
+            start.observation,
+            start.turn,
+            context=Context(context.observation, context.action, context.turn) if plan.context else None,
+            min_p=plan.min_p,
+        )
 
     def learn_from_dream(self, learner: ppo.Learner, trajectory: ppo.Trajectory) -> tuple[ppo.Learner, Metrics]:
         """PPO on one imagined trajectory."""

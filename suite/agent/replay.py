@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from suite.config import Config
-from suite.interface.environment import EnvironmentSpec
+from suite.interface.environment import EnvironmentSpec, State
 from suite.interface.turns import Turn
 from suite.policy.ppo import Trajectory
 
@@ -33,6 +33,7 @@ class Experience:
       terminated: bool; the step ended the episode by the rules.
       first: bool; the frame opens an episode.
       turn: whose move it was and what was allowed; None for single-agent tasks.
+      state: the environment's own state at the frame, for agents that dream in the true game; else None.
     """
 
     observation: jax.Array
@@ -41,6 +42,7 @@ class Experience:
     terminated: jax.Array
     first: jax.Array
     turn: Turn | None = None
+    state: State = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,8 +68,8 @@ class Replay:
             max_length_time_axis=self.length,
         )
 
-    def init(self, spec: EnvironmentSpec) -> ReplayState:
-        """An empty buffer."""
+    def init(self, spec: EnvironmentSpec, state: State = None) -> ReplayState:
+        """An empty buffer; `state`: the shapes of one environment's state, where states are kept."""
         step = Experience(
             observation=jnp.zeros(spec.observation.shape, jnp.uint8),
             action=jnp.zeros((), jnp.int32),
@@ -75,6 +77,7 @@ class Replay:
             terminated=jnp.zeros((), bool),
             first=jnp.zeros((), bool),
             turn=_no_turn(spec) if spec.two_player else None,
+            state=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state),
         )
         return self._buffer(1, 1).init(step)
 
@@ -87,13 +90,29 @@ class Replay:
             terminated=trajectory.terminated_TB,
             first=trajectory.first_TB,
             turn=trajectory.turn_TB,
+            state=trajectory.state_TB,
         )
         return self._buffer(1, 1).add(state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), experience))
 
-    def sample(self, state: ReplayState, key: jax.Array, batch: int, length: int) -> Experience:
-        """`batch` sequences of `length` consecutive steps, uniform over all stored; leading axes [batch, length]."""
+    def sample(self, state: ReplayState, key: jax.Array, batch: int, length: int, recent: int = 0) -> Experience:
+        """`batch` sequences of `length` consecutive steps; leading axes [batch, length].
+
+        Uniform over all that is stored or, with `recent`, over those that end in the latest so many steps of each
+        environment.
+        """
+        if recent:
+            return self._sample_recent(state, key, batch, length, recent)
         with jax.numpy_rank_promotion("allow"):  # flashbax broadcasts as NumPy does
             return self._buffer(batch, length).sample(state, key).experience
+
+    def _sample_recent(self, state: ReplayState, key: jax.Array, batch: int, length: int, recent: int) -> Experience:
+        row_key, age_key = jax.random.split(key)
+        row_N = jax.random.randint(row_key, (batch,), 0, self.num_envs)
+        stored = jnp.where(state.is_full, self.length, state.current_index)
+        age_N = jax.random.randint(age_key, (batch,), 0, jnp.minimum(recent, stored - length + 1))
+        first_N = state.current_index - length - age_N
+        time_NT = (first_N[:, None] + jnp.arange(length)[None]) % self.length
+        return jax.tree.map(lambda x: x[row_N[:, None], time_NT], state.experience)
 
 
 def _no_turn(spec: EnvironmentSpec) -> Turn:

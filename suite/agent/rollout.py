@@ -114,6 +114,7 @@ def rollout(
     environment: BatchedEnvironment,
     player: Player,
     length: int,
+    keep_states: bool = False,
 ) -> tuple[Player, Trajectory, EpisodeLog]:
     """`length` events in each of B environments.
 
@@ -124,6 +125,7 @@ def rollout(
       environment: the real environments or a dream.
       player: where to go on from; its memory already refreshed.
       length: T.
+      keep_states: put the environments' own states into the trajectory, beside each frame.
 
     Returns:
       the player after the last event, the trajectory [T, B] for PPO, and the episodes' totals.
@@ -166,6 +168,7 @@ def rollout(
             last_value_B=jnp.zeros_like(after.reward),
             truncation_value_TB=truncation_value_B,
             turn_TB=turn,
+            state_TB=player.state if keep_states else None,
         )
         counts_B = jnp.ones_like(ended_B) if turn is None else turn.player != CHANCE
         log = EpisodeLog(counts_B, ended_B, return_B, length_B, after.statistics)

@@ -6,7 +6,7 @@ import argparse
 
 from suite.commands.configuration import add_configuration as add_arguments
 from suite.commands.list import published
-from suite.commands.printing import print_json, print_table
+from suite.commands.printing import make_reporter, print_json, print_table
 
 __all__ = ["SUMMARY", "add_arguments", "execute"]
 
@@ -19,8 +19,12 @@ def execute(args: argparse.Namespace) -> int:
     layers = registry.layers(args.task, args.agent, args.preset, args.overrides, 0, args.steps)
 
     from suite.describe import describe
+    from suite.evaluation import agent_for
 
-    description = describe(layers, registry.task(args.task).spec())
+    config, state = layers[-1][1], None
+    if config.imagination.world == "game":  # only then is the game itself looked at
+        state = agent_for(config, make_reporter(args.json)).kept_state
+    description = describe(layers, registry.task(args.task).spec(), state)
     if args.json:
         print_json(description.as_dict())
         return 0

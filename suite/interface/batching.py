@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from suite.interface.environment import Environment, EnvironmentSpec, State, TimeStep
+from suite.interface.turns import Turn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +59,59 @@ class Batched:
         state, shown = jax.lax.fori_loop(0, ended_B.sum(), reset_one, (state, shown))
         return state, dataclasses.replace(stepped, first=ended_B, **shown)
 
+    def resumed(self, state: State, observation_BO: jax.Array, first_B: jax.Array, turn_B: Turn | None) -> Resumed:
+        """The same environments, at the given states: what was seen there, whether it opens an episode, whose turn."""
+        statistics = jax.eval_shape(self.reset, jax.random.key(0))[1].statistics
+        no_B = jnp.zeros_like(first_B)
+        time_step = TimeStep(
+            observation=observation_BO,
+            reward=jnp.zeros(first_B.shape, jnp.float32),
+            terminated=no_B,
+            truncated=no_B,
+            first=first_B,
+            final_observation=observation_BO,
+            statistics=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), statistics),
+            turn=turn_B,
+        )
+        return Resumed(self, state, time_step)
+
     def _reset(self, key: jax.Array, index: jax.Array) -> tuple[State, TimeStep]:
         if not self.spec.two_player:
             return self.environment.reset(key)
         return self.environment.reset(key, (1 + index % 2).astype(jnp.int32))
+
+
+@dataclasses.dataclass(frozen=True)
+class Resumed:
+    """A `BatchedEnvironment` that starts from given states. Build it inside the jitted function that uses it.
+
+    An environment whose episode ends goes on with a fresh one, as those of `Batched` do.
+
+    Attributes:
+      batched: the rules.
+      state: of each environment; every array leads with B.
+      time_step: what is seen there.
+    """
+
+    batched: Batched
+    state: State
+    time_step: TimeStep
+
+    @property
+    def spec(self) -> EnvironmentSpec:
+        """What the task is."""
+        return self.batched.spec
+
+    @property
+    def num_envs(self) -> int:
+        """B, the number of start states."""
+        return self.batched.num_envs
+
+    def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
+        """The given states as they are; `key` is not used."""
+        del key
+        return self.state, self.time_step
+
+    def step(self, key: jax.Array, state: State, action_B: jax.Array) -> tuple[State, TimeStep]:
+        """One step of each; see `Batched.step`."""
+        return self.batched.step(key, state, action_B)

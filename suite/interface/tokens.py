@@ -26,6 +26,7 @@ class TokenSpec:
       player_actions: A of a two-player game, whose turns are predicted too; 0 for single-agent tasks.
       chance_outcomes: C of a two-player game.
       token_size: numbers in a token that is no code but a vector; 0: tokens are codes.
+      spatial: tokens are patches of a picture, whose neighbours in the grid are neighbours in what is shown.
     """
 
     tokens_per_frame: int
@@ -36,6 +37,7 @@ class TokenSpec:
     player_actions: int = 0
     chance_outcomes: int = 0
     token_size: int = 0
+    spatial: bool = True
 
     @property
     def two_player(self) -> bool:

@@ -7,6 +7,7 @@ Shapes: T steps, B environments, A actions, H memory units. In two-player games 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +49,7 @@ class Trajectory:
       truncation_value_TB: float32, of the last observation of a truncated episode, in units of reward; else 0.
       turn_TB: whose turns they were; None for single-agent tasks: all are ours, and every action is legal.
       last_ours_B: bool; the observation after the last step is ours to act on. None for single-agent tasks.
+      state_TB: the environments' own states at each step, where they were asked for; PPO does not look at them.
     """
 
     observation_TB: jax.Array
@@ -63,6 +65,7 @@ class Trajectory:
     truncation_value_TB: jax.Array
     turn_TB: Turn | None = None
     last_ours_B: jax.Array | None = None
+    state_TB: Any = None
 
     @property
     def acting_TB(self) -> jax.Array | None:

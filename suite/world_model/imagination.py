@@ -12,7 +12,7 @@ from flax import struct
 from suite.interface.environment import EnvironmentSpec, TimeStep
 from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec, decode_frame, encode_frame
 from suite.interface.turns import CHANCE, Turn, stream_action
-from suite.world_model.heads import TurnLogits
+from suite.world_model.heads import TurnLogits, filled_odds
 from suite.world_model.transformer import Cache, WorldModel
 
 
@@ -23,6 +23,21 @@ class DreamState:
     cache: Cache
     tokens_BL: jax.Array
     turn_B: Turn | None = None
+
+
+@struct.dataclass
+class Context:
+    """C real steps that lead to a dream's start frames, time-major, oldest first.
+
+    Attributes:
+      observation_CBO: uint8.
+      action_CB: int32, taken on them, in the player's own numbering.
+      turn_CB: whose turns they were; None for single-agent tasks.
+    """
+
+    observation_CBO: jax.Array
+    action_CB: jax.Array
+    turn_CB: Turn | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +57,8 @@ class Dream:
       horizon: T_WM, steps.
       start_observation_BO: uint8; real frames. Callers that know what came before them burn the policy's memory in.
       start_turn_B: whose turn it is there; None for single-agent tasks.
+      context: real steps before them that the model sees too; None: its view begins with the start frames (note 24).
+      min_p: codes less likely than this share of the likeliest are not drawn.
     """
 
     model: WorldModel
@@ -52,6 +69,8 @@ class Dream:
     horizon: int
     start_observation_BO: jax.Array
     start_turn_B: Turn | None = None
+    context: Context | None = None
+    min_p: float = 0.0
 
     @property
     def num_envs(self) -> int:
@@ -64,9 +83,21 @@ class Dream:
         turn_B = self.start_turn_B
         tokens_BL = encode_frame(self.tokenizer, self.tokenizer_state, self.start_observation_BO, turn_B)
         never_B = jnp.zeros((self.num_envs,), bool)
-        cache = self.model.init_cache(self.num_envs, self.horizon)
+        cache = self._remember()
         time_step = _time_step(self.start_observation_BO, jnp.zeros((self.num_envs,), jnp.float32), never_B, turn_B)
         return DreamState(cache, tokens_BL, turn_B), time_step
+
+    def _remember(self) -> Cache:
+        """A cache with room for the dream, and what the model saw before its start frames."""
+        if self.context is None:
+            return self.model.init_cache(self.num_envs, self.horizon)
+        seen = self.context
+        turn_CB, action_CB = seen.turn_CB, seen.action_CB
+        tokens_CBL = encode_frame(self.tokenizer, self.tokenizer_state, seen.observation_CBO, turn_CB)
+        if turn_CB is not None:
+            action_CB = stream_action(turn_CB, action_CB)
+        cache = self.model.init_cache(self.num_envs, self.horizon + len(action_CB))
+        return self.model.remember(cache, tokens_CBL.swapaxes(0, 1), action_CB.swapaxes(0, 1))
 
     def step(self, key: jax.Array, state: DreamState, action_B: jax.Array) -> tuple[DreamState, TimeStep]:
         """Samples reward, termination, the next frame's tokens and turn, given everything since the start frame."""
@@ -76,7 +107,7 @@ class Dream:
         stream_action_B = action_B if turn_B is None else stream_action(turn_B, action_B)
         valid_K = self.tokenizer.valid_codes(self.tokenizer_state)
         cache, hidden_BSD, tokens_BL = next_frame(
-            token_key, self.model, state.cache, state.tokens_BL, stream_action_B, valid_K
+            token_key, self.model, state.cache, state.tokens_BL, stream_action_B, valid_K, self.min_p
         )
         reward_class_B = jax.random.categorical(reward_key, self.model.reward_logits(hidden_BSD, seat_B))
         terminated_B = jax.random.categorical(termination_key, self.model.termination_logits(hidden_BSD)) == 1
@@ -88,7 +119,13 @@ class Dream:
 
 
 def next_frame(
-    key: jax.Array, model: WorldModel, cache: Cache, tokens_BL: jax.Array, action_B: jax.Array, valid_K: jax.Array
+    key: jax.Array,
+    model: WorldModel,
+    cache: Cache,
+    tokens_BL: jax.Array,
+    action_B: jax.Array,
+    valid_K: jax.Array,
+    min_p: float = 0.0,
 ) -> tuple[Cache, jax.Array, jax.Array]:
     """The cache with this frame and action, their hidden states [B, S, D], and the next frame's tokens [B, L]."""
     cache, hidden_BSD = model.step(cache, tokens_BL, action_B)
@@ -97,7 +134,7 @@ def next_frame(
     elif model.token_size:
         next_BL = jnp.clip(model.observation_logits(hidden_BSD), 0, 1)  # a regression's only guess
     else:
-        next_BL = sample_next_tokens(key, model.observation_logits(hidden_BSD), valid_K)
+        next_BL = draw(key, model.token_odds(hidden_BSD, tokens_BL, valid_K), min_p)
     return cache, hidden_BSD, next_BL
 
 
@@ -111,7 +148,7 @@ def sample_one_by_one(
 
     def sample(key: jax.Array, hidden_BD: jax.Array) -> tuple[jax.Array, jax.Array]:
         logits_BK = model.observation_head(hidden_BD)
-        token_B1 = sample_next_tokens(key, logits_BK[:, None], valid_K)
+        token_B1 = draw(key, filled_odds(logits_BK[:, None], valid_K))
         log_BK = jax.nn.log_softmax(jnp.where(valid_K[None], logits_BK, -jnp.inf))
         return token_B1[:, 0], jnp.take_along_axis(log_BK, token_B1, axis=1)[:, 0]
 
@@ -128,16 +165,20 @@ def sample_one_by_one(
     return token_BL, jnp.concatenate([first_log_B[None], log_LB]).swapaxes(0, 1)
 
 
-def sample_next_tokens(key: jax.Array, logits_BLK: jax.Array, valid_K: jax.Array) -> jax.Array:
-    """int32 [B, L]: every token, in parallel and independently, among the filled codes.
+def draw(key: jax.Array, probability_BLK: jax.Array, min_p: float = 0.0) -> jax.Array:
+    """int32 [B, L]: every token, in parallel and independently, with these probabilities.
+
+    With `min_p`, codes of less than that share of the likeliest one's probability are left out.
 
     By inverting the cumulative distribution, which takes one random number per token. Adding noise to every logit takes
     K of them, and on a CPU six times as long as this (K = 512).
     """
-    probability_BLK = jax.nn.softmax(jnp.where(valid_K[None, None], logits_BLK, -jnp.inf))
+    if min_p:
+        least_BL1 = min_p * probability_BLK.max(-1, keepdims=True)
+        probability_BLK = jnp.where(probability_BLK >= least_BL1, probability_BLK, 0.0)
     cumulative_BLK = jnp.cumsum(probability_BLK, axis=-1)
     # Keep off the very end, where rounding would let the unfilled codes behind the last filled one in.
-    uniform_BL1 = jax.random.uniform(key, (*logits_BLK.shape[:-1], 1)) * (1 - 1e-5)
+    uniform_BL1 = jax.random.uniform(key, (*probability_BLK.shape[:-1], 1)) * (1 - 1e-5)
     return (cumulative_BLK <= uniform_BL1 * cumulative_BLK[..., -1:]).sum(-1, dtype=jnp.int32)
 
 

@@ -13,6 +13,7 @@ from flax import nnx, struct
 from suite.config import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.interface.turns import CHANCE, Turn
+from suite.world_model.correspondence import mixture_loss
 from suite.world_model.heads import TurnLogits
 from suite.world_model.transformer import WorldModel
 
@@ -74,9 +75,10 @@ def make_optimizer(config: WorldModelConfig) -> optax.GradientTransformation:
     )
 
 
-def metrics_of(spec: TokenSpec) -> tuple[str, ...]:
+def metrics_of(spec: TokenSpec, config: WorldModelConfig) -> tuple[str, ...]:
     """Names of the scalars that `update` returns for such a stream."""
-    return METRICS + TURN_METRICS if spec.two_player else METRICS
+    copied = ("copied_share",) if config.correspondence else ()
+    return METRICS + copied + (TURN_METRICS if spec.two_player else ())
 
 
 def losses(
@@ -100,7 +102,7 @@ def losses(
         hidden_BTSD = model(frame, sequences.action_BT, dropout_key)
         target_BTL, before_BTL = following, frame
         weight_BTL = jnp.broadcast_to(token_weight_BT[..., None], frame.shape[:3])
-        token_loss_BTL, correct_BTL = _token_losses(model, hidden_BTSD, target_BTL)
+        token_loss_BTL, correct_BTL, copied_BTL = _token_losses(model, hidden_BTSD, target_BTL, frame)
     else:
         # All tokens of the last frame are predicted (Eq. 2), for a dream needs them: the model reads it too, with an
         # action that predicts nothing and that nothing sees.
@@ -108,7 +110,7 @@ def losses(
         hidden_BTSD = model(whole, jnp.pad(sequences.action_BT, ((0, 0), (0, 1))), dropout_key)
         behind = jnp.concatenate([following, whole[:, -1:]], axis=1)
         target_BTL = model.observation_targets(whole, behind)
-        token_loss_BTL, correct_BTL = _token_losses(model, hidden_BTSD, target_BTL)
+        token_loss_BTL, correct_BTL, copied_BTL = _token_losses(model, hidden_BTSD, target_BTL, whole)
         hidden_BTSD = hidden_BTSD[:, :-1]
         # Changed is what differs from the frame before; the first has none.
         before_BTL = model.observation_targets(jnp.concatenate([whole[:, :1], frame], axis=1), whole)
@@ -134,6 +136,8 @@ def losses(
         "reward_accuracy": _mean(reward_correct_BT, step_weight_BT),
         "termination_loss": _mean(termination_loss_BT, step_weight_BT),
     }
+    if model.gate_head is not None:
+        metrics["copied_share"] = _mean(copied_BTL, weight_BTL)
     other = metrics["reward_loss"] + metrics["termination_loss"]
     loss = metrics["observation_loss"] + config.reward_weight * other
     if turn_BT is not None:
@@ -200,29 +204,34 @@ def cross_entropy(logits: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.
     return jax.nn.logsumexp(logits, axis=-1) - chosen, (chosen >= logits.max(-1)).astype(jnp.float32)
 
 
-def _token_losses(model: WorldModel, hidden_BTSD: jax.Array, target_BTL: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Observation cross-entropy [B, T, L] and correctness, a few sequences at a time.
+def _token_losses(
+    model: WorldModel, hidden_BTSD: jax.Array, target_BTL: jax.Array, frame_BTL: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Observation cross-entropy [B, T, L], correctness and the share that is copied, a few sequences at a time.
 
     The logits of a chunk are dropped and computed again for the backward pass, so that never are there B * T * L * K.
     """
 
     @jax.checkpoint
-    def chunk_losses(hidden: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def chunk_losses(hidden: jax.Array, target: jax.Array, frame: jax.Array) -> tuple[jax.Array, ...]:
         predicted = model.observation_logits(hidden)
+        if model.gate_head is not None:
+            return mixture_loss(predicted, model.log_gate(hidden), model.sources(frame), target)
+        none = jnp.zeros(target.shape[:3], jnp.float32)
         if not model.token_size:
-            return cross_entropy(predicted, target)
+            return *cross_entropy(predicted, target), none
         distance = jnp.square(predicted - target).sum(-1)
-        return distance, (distance <= SAME_PATCH).astype(jnp.float32)
+        return distance, (distance <= SAME_PATCH).astype(jnp.float32), none
 
     batch, tokens = target_BTL.shape[0], (*hidden_BTSD.shape[:2], model.block - 1)
     logits = math.prod(tokens[1:]) * model.observation_head.bias.shape[0]
     chunk = max(
         size for size in range(1, batch + 1) if batch % size == 0 and size * logits <= max(CHUNK_LOGITS, logits)
     )
-    split = (hidden_BTSD, target_BTL)
+    split = (hidden_BTSD, target_BTL, frame_BTL)
     chunked = jax.tree.map(lambda x: x.reshape(batch // chunk, chunk, *x.shape[1:]), split)
-    loss, correct = jax.lax.map(lambda pair: chunk_losses(*pair), chunked)
-    return loss.reshape(tokens), correct.reshape(tokens)
+    loss, correct, copied = jax.lax.map(lambda parts: chunk_losses(*parts), chunked)
+    return loss.reshape(tokens), correct.reshape(tokens), copied.reshape(tokens)
 
 
 def _weights(sequences: Sequences, mask_after_done: bool) -> tuple[jax.Array, jax.Array]:

@@ -15,14 +15,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx, struct
 from jax.typing import DTypeLike
 
 from suite.config import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
+from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
 from suite.world_model.dropout import dropout
-from suite.world_model.heads import Head, TurnHead, TurnLogits
+from suite.world_model.heads import Head, SummaryPool, TurnHead, TurnLogits, filled_odds
 
 TERMINATION_CLASSES = 2
 
@@ -117,6 +119,33 @@ class WorldModel(nnx.Module):
         self.reward_head = Head(config, self.seats * len(tokens.reward_classes), self.dtype, rngs)
         self.termination_head = Head(config, TERMINATION_CLASSES, self.dtype, rngs)
         self.turn_head = TurnHead(config, tokens, self.dtype, rngs) if tokens.two_player else None
+        # What is not the paper's comes last, so that the rest is initialised as without it.
+        self.radius = config.correspondence_radius if tokens.spatial else 0
+        sources = (2 * self.radius + 1) ** 2
+        self.gate_head = Head(config, 1 + sources, self.dtype, rngs) if config.correspondence else None
+        local = config.local_embedding if tokens.spatial else 0
+        self.local_embedding = nnx.Embed(codes, local, embedding_init=init, rngs=rngs) if local else None
+        self.local_mix = (
+            nnx.Linear(9 * local, width, dtype=self.dtype, kernel_init=init, rngs=rngs) if local else None
+        )
+        self.token_action_embedding = (
+            nnx.Embed(tokens.num_actions, width, embedding_init=init, rngs=rngs) if config.action_in_tokens else None
+        )
+        self.pool = SummaryPool(config, self.dtype, rngs) if config.pooled_heads else None
+        product = config.product_embedding
+        self.product_embedding = (
+            nnx.Embed(codes, 2 * product, embedding_init=init, rngs=rngs) if product and not tokens.spatial else None
+        )
+        self.product_action = (
+            nnx.Embed(tokens.num_actions, 2 * product, embedding_init=init, rngs=rngs)
+            if product and not tokens.spatial
+            else None
+        )
+        self.product_mix = (
+            nnx.Linear(product, width, dtype=self.dtype, kernel_init=init, rngs=rngs)
+            if product and not tokens.spatial
+            else None
+        )
 
     def __call__(self, tokens_BTL: jax.Array, action_BT: jax.Array, dropout_key: jax.Array | None = None) -> jax.Array:
         """Hidden states [B, T, S, D] (float32) of whole sequences; without `dropout_key` nothing is dropped."""
@@ -172,7 +201,7 @@ class WorldModel(nnx.Module):
 
         In a game, of the reward of player `seat` (int32 [B, T]): the stream itself does not say which of them is ours.
         """
-        logits = self.reward_head(hidden[..., -1, :])
+        logits = self.reward_head(self._summary(hidden))
         if seat is None:
             return logits
         first, second = jnp.split(logits, self.seats, axis=-1)
@@ -180,12 +209,36 @@ class WorldModel(nnx.Module):
 
     def termination_logits(self, hidden: jax.Array) -> jax.Array:
         """float32 [B, T, 2]: (goes on, terminated), from hidden states [B, T, S, D] (or without the T axis)."""
-        return self.termination_head(hidden[..., -1, :])
+        return self.termination_head(self._summary(hidden))
 
     def turn_logits(self, hidden: jax.Array) -> TurnLogits:
         """Of a game's next turn, from hidden states [B, T, S, D] (or without the T axis)."""
         assert self.turn_head is not None
-        return self.turn_head(hidden[..., -1, :])
+        return self.turn_head(self._summary(hidden))
+
+    def _summary(self, hidden: jax.Array) -> jax.Array:
+        """What is read for reward, termination and turns: [..., D] of hidden states [..., S, D]."""
+        summary = hidden[..., -1, :]
+        return summary if self.pool is None else summary + self.pool(hidden)
+
+    def log_gate(self, hidden: jax.Array) -> jax.Array:
+        """The correspondence head's gates, float32 [..., L, 1 + S], normalised; -inf where there is no source."""
+        assert self.gate_head is not None and self.grid is not None
+        open_LS = np.pad(inside(self.grid, self.radius), ((0, 0), (1, 0)), constant_values=True)
+        logits = self.gate_head(hidden[..., :-1, :])
+        return jax.nn.log_softmax(jnp.where(open_LS.reshape((1,) * (logits.ndim - 2) + open_LS.shape), logits, -jnp.inf))
+
+    def sources(self, tokens: jax.Array) -> jax.Array:
+        """The tokens that each place of the next frame may be copied from: [..., L] to [..., L, S]."""
+        assert self.grid is not None
+        return neighbourhood(tokens, self.grid, self.radius, tokens.ndim - 1, OUTSIDE)
+
+    def token_odds(self, hidden_BSD: jax.Array, tokens_BL: jax.Array, valid_K: jax.Array) -> jax.Array:
+        """Probabilities [B, L, K] of the next frame's tokens, from this one's hidden states and tokens."""
+        made_BLK = filled_odds(self.observation_logits(hidden_BSD), valid_K)
+        if self.gate_head is None:
+            return made_BLK
+        return mixture_odds(made_BLK, self.log_gate(hidden_BSD), self.sources(tokens_BL))
 
     def init_cache(self, batch: int, length: int) -> Cache:
         """An empty cache for `length` steps of `batch` streams, and the tokens of the frame that the last leads to."""
@@ -197,6 +250,12 @@ class WorldModel(nnx.Module):
     def step(self, cache: Cache, tokens_BL: jax.Array, action_B: jax.Array) -> tuple[Cache, jax.Array]:
         """Appends one block to the cache; its hidden states [B, S, D] equal those of the whole sequence's pass."""
         return self._append(cache, self._embed(tokens_BL, action_B))
+
+    def remember(self, cache: Cache, tokens_BCL: jax.Array, action_BC: jax.Array) -> Cache:
+        """Appends C blocks to the cache, all at once."""
+        x_BCSD = self._embed(tokens_BCL, action_BC)
+        cache, _ = self._append(cache, x_BCSD.reshape(len(x_BCSD), -1, x_BCSD.shape[-1]))
+        return cache
 
     def append_token(self, cache: Cache, token_B: jax.Array, place: jax.Array) -> tuple[Cache, jax.Array]:
         """Appends one token of a frame, the one at `place` (int32 scalar) of L; its hidden state [B, D]."""
@@ -235,7 +294,17 @@ class WorldModel(nnx.Module):
         if self.codes_per_place:
             places = self.codes_per_place * jnp.arange(tokens.shape[-1])
             tokens = tokens + places.reshape((1,) * (tokens.ndim - 1) + (-1,))
-        return jnp.concatenate([self.token_embedding(tokens), self.action_embedding(action)[..., None, :]], axis=-2)
+        x, last = self.token_embedding(tokens), self.action_embedding(action)
+        if self.local_embedding is not None:
+            around = neighbourhood(self.local_embedding(tokens), self.grid, 1, tokens.ndim - 1)
+            x = x + self.local_mix(around.reshape(*tokens.shape, -1))
+        if self.token_action_embedding is not None:
+            x = x + self.token_action_embedding(action)[..., None, :]
+        if self.product_embedding is not None:
+            both = self.product_embedding(tokens).sum(-2) + self.product_action(action)
+            left, right = jnp.split(both, 2, axis=-1)
+            last = last + self.product_mix(left * right)
+        return jnp.concatenate([x, last[..., None, :]], axis=-2)
 
 
 def layer_norm(width: int, rngs: nnx.Rngs) -> nnx.LayerNorm:
