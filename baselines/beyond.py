@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from suite.config import Config
 from suite.overrides import apply_changes
 
-LOCAL_EMBEDDING = 16  # numbers that the tokens around each one are embedded in
+Part = Callable[[Config], dict[str, Any]]
 
-# Each part of M6 by name: what it changes of M5, and what takes it away again.
-PARTS: dict[str, dict[str, Any]] = {
-    "correspondence": {"world_model.correspondence": True},
-    "grid": {"world_model.positions": "grid"},
-    "local": {"world_model.local_embedding": LOCAL_EMBEDDING},
-    "action": {"world_model.action_in_tokens": True},
-    "min_p": {"imagination.min_p": 0.2},
+LOCAL_EMBEDDING = 16  # numbers that the tokens around each one are embedded in
+CONTEXT = 3  # real frames before a dream's first: enough to tell how fast what moves
+MIN_P = 0.2
+
+# Each part of M6 by name: what it changes of M5.
+PARTS: dict[str, Part] = {
+    "correspondence": lambda config: {"world_model.correspondence": True},
+    "grid": lambda config: {"world_model.positions": "grid"},
+    "local": lambda config: {"world_model.local_embedding": LOCAL_EMBEDDING},
+    "action": lambda config: {"world_model.action_in_tokens": True},
+    "min_p": lambda config: {"imagination.min_p": MIN_P},
+    "context": lambda config: {
+        "imagination.context": CONTEXT,
+        "world_model.sequence_length": config.world_model.sequence_length + CONTEXT,
+    },
 }
 
 
 def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
-    Five parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
-    of the tokens around each one, the action added to every token, and dreams without improbable tokens.
+    Six parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
+    of the tokens around each one, the action added to every token, dreams without improbable tokens, and dreams that
+    know the frames before their first.
     """
     return _with_parts(config, PARTS)
 
@@ -41,5 +51,5 @@ def oracle(config: Config) -> Config:
     return apply_changes(config, {"world_model.enabled": False, "imagination.world": "game"})
 
 
-def _with_parts(config: Config, parts: dict[str, dict[str, Any]]) -> Config:
-    return apply_changes(config, {name: value for changes in parts.values() for name, value in changes.items()})
+def _with_parts(config: Config, parts: Mapping[str, Part]) -> Config:
+    return apply_changes(config, {name: value for part in parts.values() for name, value in part(config).items()})

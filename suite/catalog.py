@@ -276,6 +276,7 @@ AGENTS = (
             ("local", "that embeds each token alone"),
             ("action", "whose action is a token and nothing more"),
             ("min_p", "that dreams improbable tokens too"),
+            ("context", "whose dreams know no frame before their first"),
         )
     ),
     AgentEntry(

@@ -131,14 +131,12 @@ class WorldModelConfig:
     dropout: Rate = 0.1  # embedding, attention and residual
     initial_std: PositiveFloat = 0.02  # of every kernel and embedding, GPT-2's; narrow models learn faster from more
     positions: Literal["flat", "grid"] = "flat"  # RoPE over the token index, or over (time, row, column): note 20
-    # The next frame's tokens are copied from around their place or made new (`world_model.correspondence`); not the paper's.
+    # This and the next three are not the paper's (docs/agents.md). Tokens are copied from around their place, or made new.
     correspondence: bool = False
     correspondence_radius: NotNegative = 1  # of the square that is copied from; symbols: their own place alone
     # Numbers in a further embedding of the 3x3 tokens around each, of which its own embedding gets a sum; 0: none.
     local_embedding: NotNegative = 0
     action_in_tokens: bool = False  # an embedding of the action is added to every token of its block
-    pooled_heads: bool = False  # reward, termination and turns are read off all tokens' outputs, not the action's alone
-    product_embedding: NotNegative = 0
     # Symbols are embedded by value and place, since the same value means different things in different places; the
     # paper does not say. false: by value alone, as patches are.
     symbol_places: bool = True

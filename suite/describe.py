@@ -83,9 +83,7 @@ class Description:
         }
 
 
-def describe(
-    layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec, state: State = None
-) -> Description:
+def describe(layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec, state: State = None) -> Description:
     """Describes the configuration that `suite.registry.layers` made for a task of this specification.
 
     Args:

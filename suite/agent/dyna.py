@@ -308,7 +308,9 @@ class Agent:
         _, trajectory, _ = play.rollout(rollout_key, policy, learner.targets, dream, player, plan.horizon)
         return trajectory
 
-    def _dreamt_world(self, model: WorldModel | None, tokenizer: TokenizerState, past: Experience) -> BatchedEnvironment:
+    def _dreamt_world(
+        self, model: WorldModel | None, tokenizer: TokenizerState, past: Experience
+    ) -> BatchedEnvironment:
         """The world model, or the true game, at the last of the replayed steps `past` (time-major)."""
         plan = self.config.imagination
         start = jax.tree.map(lambda x: x[-1], past)

@@ -35,20 +35,6 @@ def filled_odds(logits: jax.Array, valid_K: jax.Array) -> jax.Array:
     return jax.nn.softmax(jnp.where(valid_K.reshape((1,) * (logits.ndim - 1) + (-1,)), logits, -jnp.inf))
 
 
-class SummaryPool(nnx.Module):
-    """What all tokens of a block say together, to be added to its action's output: [..., S, D] to [..., D]."""
-
-    def __init__(self, config: WorldModelConfig, dtype: DTypeLike, rngs: nnx.Rngs):
-        width, init = config.embed_dim, nnx.initializers.normal(config.initial_std)
-        self.inputs = nnx.Linear(width, width, dtype=dtype, kernel_init=init, rngs=rngs)
-        self.outputs = nnx.Linear(2 * width, width, dtype=dtype, kernel_init=init, rngs=rngs)
-
-    def __call__(self, hidden: jax.Array) -> jax.Array:
-        features = nnx.relu(self.inputs(hidden[..., :-1, :]))
-        pooled = jnp.concatenate([features.max(-2), features.mean(-2)], axis=-1)
-        return self.outputs(pooled).astype(hidden.dtype)
-
-
 PLAYERS = 3  # chance, player 1, player 2
 
 

@@ -24,7 +24,7 @@ from suite.interface.tokens import TokenSpec
 from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
 from suite.world_model.dropout import dropout
-from suite.world_model.heads import Head, SummaryPool, TurnHead, TurnLogits, filled_odds
+from suite.world_model.heads import Head, TurnHead, TurnLogits, filled_odds
 
 TERMINATION_CLASSES = 2
 
@@ -123,28 +123,11 @@ class WorldModel(nnx.Module):
         self.radius = config.correspondence_radius if tokens.spatial else 0
         sources = (2 * self.radius + 1) ** 2
         self.gate_head = Head(config, 1 + sources, self.dtype, rngs) if config.correspondence else None
-        local = config.local_embedding if tokens.spatial else 0
+        local = config.local_embedding if tokens.spatial else 0  # neighbours in a list of symbols mean nothing
         self.local_embedding = nnx.Embed(codes, local, embedding_init=init, rngs=rngs) if local else None
-        self.local_mix = (
-            nnx.Linear(9 * local, width, dtype=self.dtype, kernel_init=init, rngs=rngs) if local else None
-        )
+        self.local_mix = nnx.Linear(9 * local, width, dtype=self.dtype, kernel_init=init, rngs=rngs) if local else None
         self.token_action_embedding = (
             nnx.Embed(tokens.num_actions, width, embedding_init=init, rngs=rngs) if config.action_in_tokens else None
-        )
-        self.pool = SummaryPool(config, self.dtype, rngs) if config.pooled_heads else None
-        product = config.product_embedding
-        self.product_embedding = (
-            nnx.Embed(codes, 2 * product, embedding_init=init, rngs=rngs) if product and not tokens.spatial else None
-        )
-        self.product_action = (
-            nnx.Embed(tokens.num_actions, 2 * product, embedding_init=init, rngs=rngs)
-            if product and not tokens.spatial
-            else None
-        )
-        self.product_mix = (
-            nnx.Linear(product, width, dtype=self.dtype, kernel_init=init, rngs=rngs)
-            if product and not tokens.spatial
-            else None
         )
 
     def __call__(self, tokens_BTL: jax.Array, action_BT: jax.Array, dropout_key: jax.Array | None = None) -> jax.Array:
@@ -201,7 +184,7 @@ class WorldModel(nnx.Module):
 
         In a game, of the reward of player `seat` (int32 [B, T]): the stream itself does not say which of them is ours.
         """
-        logits = self.reward_head(self._summary(hidden))
+        logits = self.reward_head(hidden[..., -1, :])
         if seat is None:
             return logits
         first, second = jnp.split(logits, self.seats, axis=-1)
@@ -209,24 +192,21 @@ class WorldModel(nnx.Module):
 
     def termination_logits(self, hidden: jax.Array) -> jax.Array:
         """float32 [B, T, 2]: (goes on, terminated), from hidden states [B, T, S, D] (or without the T axis)."""
-        return self.termination_head(self._summary(hidden))
+        return self.termination_head(hidden[..., -1, :])
 
     def turn_logits(self, hidden: jax.Array) -> TurnLogits:
         """Of a game's next turn, from hidden states [B, T, S, D] (or without the T axis)."""
         assert self.turn_head is not None
-        return self.turn_head(self._summary(hidden))
-
-    def _summary(self, hidden: jax.Array) -> jax.Array:
-        """What is read for reward, termination and turns: [..., D] of hidden states [..., S, D]."""
-        summary = hidden[..., -1, :]
-        return summary if self.pool is None else summary + self.pool(hidden)
+        return self.turn_head(hidden[..., -1, :])
 
     def log_gate(self, hidden: jax.Array) -> jax.Array:
         """The correspondence head's gates, float32 [..., L, 1 + S], normalised; -inf where there is no source."""
         assert self.gate_head is not None and self.grid is not None
         open_LS = np.pad(inside(self.grid, self.radius), ((0, 0), (1, 0)), constant_values=True)
         logits = self.gate_head(hidden[..., :-1, :])
-        return jax.nn.log_softmax(jnp.where(open_LS.reshape((1,) * (logits.ndim - 2) + open_LS.shape), logits, -jnp.inf))
+        return jax.nn.log_softmax(
+            jnp.where(open_LS.reshape((1,) * (logits.ndim - 2) + open_LS.shape), logits, -jnp.inf)
+        )
 
     def sources(self, tokens: jax.Array) -> jax.Array:
         """The tokens that each place of the next frame may be copied from: [..., L] to [..., L, S]."""
@@ -294,17 +274,13 @@ class WorldModel(nnx.Module):
         if self.codes_per_place:
             places = self.codes_per_place * jnp.arange(tokens.shape[-1])
             tokens = tokens + places.reshape((1,) * (tokens.ndim - 1) + (-1,))
-        x, last = self.token_embedding(tokens), self.action_embedding(action)
-        if self.local_embedding is not None:
+        x = self.token_embedding(tokens)
+        if self.local_embedding is not None and self.local_mix is not None and self.grid is not None:
             around = neighbourhood(self.local_embedding(tokens), self.grid, 1, tokens.ndim - 1)
             x = x + self.local_mix(around.reshape(*tokens.shape, -1))
         if self.token_action_embedding is not None:
             x = x + self.token_action_embedding(action)[..., None, :]
-        if self.product_embedding is not None:
-            both = self.product_embedding(tokens).sum(-2) + self.product_action(action)
-            left, right = jnp.split(both, 2, axis=-1)
-            last = last + self.product_mix(left * right)
-        return jnp.concatenate([x, last[..., None, :]], axis=-2)
+        return jnp.concatenate([x, self.action_embedding(action)[..., None, :]], axis=-2)
 
 
 def layer_norm(width: int, rngs: nnx.Rngs) -> nnx.LayerNorm:

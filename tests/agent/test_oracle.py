@@ -71,7 +71,9 @@ def test_recent_steps_only(agent, played):
     replay = Replay(num_envs=2, length=7)
     state = replay.init(WideCorridor.spec)
     _, trajectory = played
-    few = jax.tree.map(lambda x: x[:5, :2], dataclasses.replace(trajectory, state_TB=None, hidden_BH=None, last_value_B=None))
+    few = jax.tree.map(
+        lambda x: x[:5, :2], dataclasses.replace(trajectory, state_TB=None, hidden_BH=None, last_value_B=None)
+    )
     for start in range(0, 15, 5):
         numbered = dataclasses.replace(few, action_TB=jnp.arange(start, start + 5)[:, None] + jnp.array([[0, 100]]))
         state = replay.add(state, numbered)

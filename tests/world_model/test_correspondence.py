@@ -107,9 +107,7 @@ def test_with_the_gates_at_new_it_is_the_plain_head_to_the_bit():
     _, same_hidden = head.step(cache, frame, action)
     np.testing.assert_array_equal(hidden, same_hidden)
     np.testing.assert_array_equal(plain.token_odds(hidden, frame, valid), head.token_odds(hidden, frame, valid))
-    losses, same = (
-        training.losses(model, real, model.config, TOKENS)[1] for model in (plain, head)
-    )
+    losses, same = (training.losses(model, real, model.config, TOKENS)[1] for model in (plain, head))
     assert same.pop("copied_share") == 0
     for name, value in losses.items():
         np.testing.assert_allclose(value, same[name], rtol=1e-6, err_msg=name)
@@ -160,9 +158,7 @@ def test_learning_to_shift():
     assert metrics["copied_share"][-20:].mean() == pytest.approx(0.75, abs=0.05)
 
 
-@pytest.mark.parametrize(
-    "other", ["world_model.block_teacher_forcing=false", "tokenizer.kind=continuous"]
-)
+@pytest.mark.parametrize("other", ["world_model.block_teacher_forcing=false", "tokenizer.kind=continuous"])
 def test_only_with_codes_and_block_teacher_forcing(other):
     from suite import registry
 

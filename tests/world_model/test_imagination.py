@@ -16,7 +16,8 @@ from suite.interface.batching import Batched
 from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
 from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
 from suite.world_model import training
-from suite.world_model.imagination import Dream, sample_next_tokens
+from suite.world_model.heads import filled_odds
+from suite.world_model.imagination import Context, Dream, draw
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import SPEC, small_config, small_model
 
@@ -172,13 +173,13 @@ def test_unfilled_codes_are_never_sampled(learned):
         seen |= set(np.unique(state.tokens_BL))
     assert seen == {0, 1, 2, 3}
     logits = jnp.zeros((50, 6, 8)).at[..., 6].set(50.0)
-    tokens = sample_next_tokens(jax.random.key(0), logits, learned.tokenizer.valid_codes(learned.codes))
+    tokens = draw(jax.random.key(0), filled_odds(logits, learned.tokenizer.valid_codes(learned.codes)))
     assert int(tokens.max()) == 3 and tokens.dtype == jnp.int32
 
 
 def test_tokens_are_sampled_from_the_softmax():
     logits = jnp.log(jnp.asarray([0.1, 0.2, 0.3, 0.4]))
-    tokens = sample_next_tokens(jax.random.key(0), jnp.broadcast_to(logits, (20_000, 2, 4)), jnp.arange(4) < 3)
+    tokens = draw(jax.random.key(0), filled_odds(jnp.broadcast_to(logits, (20_000, 2, 4)), jnp.arange(4) < 3))
     frequency = np.bincount(np.asarray(tokens).ravel(), minlength=4) / tokens.size
     np.testing.assert_allclose(frequency, [1 / 6, 2 / 6, 3 / 6, 0], atol=0.01)
     one, other = np.asarray(tokens).T  # independent of each other
@@ -192,3 +193,19 @@ def test_rewards_are_class_levels(learned):
     _, shown = play(dream, jax.random.key(0), action)
     assert set(np.unique(shown.reward)) == {-2.0, 7.0}
     assert 0 < shown.terminated.mean() < 1  # sampled, not argmaxed
+
+
+def test_context_is_what_the_model_would_remember(learned):
+    """A dream that is shown the frames before its first goes on as one that has dreamt through them."""
+    frames, action, _ = real_play(seed=5, steps=4, batch=3)
+    tokens = learned.tokenizer.encode(learned.codes, frames)
+    cache = learned.model.init_cache(3, 4)
+    for t in range(3):
+        cache, hidden = learned.model.step(cache, tokens[t], action[t])
+    context = Context(frames[:2], action[:2])
+    dream = Dream(learned.model, learned.tokenizer, learned.codes, Walk.spec, SPEC, 2, frames[2], context=context)
+    state, _ = dream.reset(jax.random.key(0))
+    assert state.cache.keys.shape == cache.keys.shape
+    after, same_hidden = learned.model.step(state.cache, state.tokens_BL, action[2])
+    np.testing.assert_allclose(hidden, same_hidden, atol=1e-4)
+    np.testing.assert_allclose(cache.keys, after.keys, atol=1e-4)
