@@ -131,7 +131,7 @@ class WorldModelConfig:
     dropout: Rate = 0.1  # embedding, attention and residual
     initial_std: PositiveFloat = 0.02  # of every kernel and embedding, GPT-2's; narrow models learn faster from more
     positions: Literal["flat", "grid"] = "flat"  # RoPE over the token index, or over (time, row, column): note 20
-    # This and the next three are not the paper's (docs/agents.md). Tokens are copied from around their place, or made new.
+    # This and the next three are not the paper's (docs/agents.md): copy tokens from near their place, or make them new.
     correspondence: bool = False
     correspondence_radius: NotNegative = 1  # of the square that is copied from; symbols: their own place alone
     # Numbers in a further embedding of the 3x3 tokens around each, of which its own embedding gets a sum; 0: none.

@@ -98,6 +98,8 @@ def test_derived(m5):
         "imagined policy updates": 174 * 150,
         "imagined steps": 174 * 150 * 48 * 20,
         "world-model gradient steps": 217 * 500 * 3,
+        # 2,666 steps of each environment: a frame of 63x63x3 bytes, action, reward and two flags (a step is 10 bytes)
+        "replay memory (MiB)": 48 * 2_666 * (63 * 63 * 3 + 10) // 2**20,
     }
 
 

@@ -309,7 +309,7 @@ class Agent:
         return trajectory
 
     def _dreamt_world(
-        self, model: WorldModel | None, tokenizer: TokenizerState, past: Experience
+        self, model: WorldModel | None, tokenizer: TokenizerState | None, past: Experience
     ) -> BatchedEnvironment:
         """The world model, or the true game, at the last of the replayed steps `past` (time-major)."""
         plan = self.config.imagination

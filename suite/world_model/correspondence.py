@@ -44,7 +44,7 @@ def neighbourhood(x: jax.Array, grid: tuple[int, int], radius: int, axis: int, f
 
 
 def inside(grid: tuple[int, int], radius: int) -> np.ndarray:
-    """bool [L, S]: whether a source stands within the frame."""
+    """Bool [L, S]: whether a source stands within the frame."""
     with jax.ensure_compile_time_eval():
         return np.asarray(neighbourhood(jnp.ones(grid[0] * grid[1], jnp.int32), grid, radius, 0)) > 0
 

@@ -136,7 +136,7 @@ def test_gradients_are_those_of_finite_differences():
 
 
 def test_learning_to_shift():
-    """A frame that is the one before, moved by a column: copied from the left but for the first column, which is new."""
+    """A frame that is the one before, moved by a column: three columns of four are copied, the first is new."""
     spec = dataclasses.replace(TOKENS, num_codes=50)
     config = small_config(correspondence=True, positions="grid", initial_std=0.1, learning_rate=3e-3)
     graph, params = nnx.split(WorldModel(config, spec, GRID, nnx.Rngs(0)))
@@ -153,7 +153,7 @@ def test_learning_to_shift():
         return training.update(config, optimizer, graph, spec, learner, batch(key), key)
 
     learner = training.WorldModelLearner(params, optimizer.init(params))
-    _, metrics = jax.jit(lambda l, k: jax.lax.scan(update, l, k))(learner, jax.random.split(jax.random.key(0), 300))
+    _, metrics = jax.jit(lambda *x: jax.lax.scan(update, *x))(learner, jax.random.split(jax.random.key(0), 300))
     assert metrics["token_accuracy"][-20:].mean() > 0.98  # 50 codes were never learned one by one in so many updates
     assert metrics["copied_share"][-20:].mean() == pytest.approx(0.75, abs=0.05)
 
@@ -162,5 +162,5 @@ def test_learning_to_shift():
 def test_only_with_codes_and_block_teacher_forcing(other):
     from suite import registry
 
-    with pytest.raises(UserError, match="world_model.correspondence=true needs"):
+    with pytest.raises(UserError, match=r"world_model\.correspondence=true needs"):
         registry.resolve("craftax_classic", "m5", "smoke", ["world_model.correspondence=true", other])
