@@ -38,6 +38,8 @@ class Rollouts:
       reward_odds: float32 [N, T, classes]; probabilities of the reward's classes, given the real frames so far.
       termination_odds: float32 [N, T]; probability that the episode ends, given the real frames so far.
       codes: codes that the real frames use; None where tokens are no codes.
+      copied: float32 [N, T]; the share of the next frame's tokens that is copied and not made anew, given the real
+        frames so far; None for models that copy nothing.
     """
 
     frames: np.ndarray
@@ -47,6 +49,7 @@ class Rollouts:
     reward_odds: np.ndarray
     termination_odds: np.ndarray
     codes: np.ndarray | None
+    copied: np.ndarray | None = None
 
     @property
     def steps(self) -> int:
@@ -69,6 +72,7 @@ def imagine(
     """
     steps = min(real.action.shape[1], agent.config.world_model.sequence_length)
     parts: list[list[np.ndarray]] = []
+    copies: list[np.ndarray] = []
     used: set[int] = set()
     for start in range(0, len(real.action), CHUNK):
         frames = real.frames[start : start + CHUNK, : steps + 1]
@@ -76,13 +80,16 @@ def imagine(
         missing = [(0, min(CHUNK, len(real.action)) - len(action))]  # one shape, one compilation
         padded = [np.pad(x, missing + [(0, 0)] * (x.ndim - 1), mode="edge") for x in (frames, action)]
         found = _imagine(agent, world_model, tokenizer, *padded, jax.random.fold_in(key, start))
-        *arrays, tokens = (np.asarray(x)[: len(action)] for x in jax.device_get(found))
+        *arrays, copied, tokens = (np.asarray(x)[: len(action)] for x in jax.device_get(found))
+        copies.append(copied)
         parts.append(arrays)
         shown = np.pad(real.frame_counted[start : start + CHUNK, :steps], ((0, 0), (1, 0)), constant_values=True)
         if agent.tokenizer.num_codes:
             used.update(np.unique(tokens[shown]).tolist())
     codes = np.array(sorted(used)) if agent.tokenizer.num_codes else None
-    return Rollouts(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)), codes=codes)  # type: ignore[misc]
+    whole = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    shares = np.concatenate(copies) if agent.config.world_model.correspondence else None
+    return Rollouts(*whole, codes=codes, copied=shares)  # type: ignore[misc]
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -94,9 +101,18 @@ def _imagine(
     action_NT: jax.Array,
     key: jax.Array,
 ) -> tuple[jax.Array, ...]:
-    """The fields of `Rollouts` in their order, with the real frames' tokens in place of `codes`."""
+    """The fields of `Rollouts` in their order but for the last two: what is copied, and the real frames' tokens."""
     model, horizon = nnx.merge(agent.world_model_graph, world_model), action_NT.shape[1]
-    dream = Dream(model, agent.tokenizer, tokenizer, agent.spec, agent.tokens, horizon, frames_NTO[:, 0])
+    dream = Dream(
+        model,
+        agent.tokenizer,
+        tokenizer,
+        agent.spec,
+        agent.tokens,
+        horizon,
+        frames_NTO[:, 0],
+        min_p=agent.config.imagination.min_p,
+    )
     start, _ = dream.reset(key)
 
     def step(state: Any, inputs: Any) -> Any:
@@ -107,11 +123,15 @@ def _imagine(
     _, imagined = jax.lax.scan(step, start, (jax.random.split(key, horizon), action_NT.T))
     tokens_NTL = agent.tokenizer.encode(tokenizer, frames_NTO)
     hidden = model(tokens_NTL[:, :-1], action_NT)
+    copied_NT = jnp.zeros(action_NT.shape)
+    if model.gate_head is not None:
+        copied_NT = 1 - jnp.exp(model.log_gate(hidden)[..., 0]).mean(-1)
     return (
         *(jnp.swapaxes(x, 0, 1) for x in imagined),
         agent.tokenizer.decode(tokenizer, tokens_NTL),
         jax.nn.softmax(model.reward_logits(hidden)),
         jax.nn.softmax(model.termination_logits(hidden))[..., 1],
+        copied_NT,
         tokens_NTL,
     )
 
@@ -130,7 +150,9 @@ def compare(
 
     Returns:
       One row per step, and a summary. Errors are squared L2 distances of frames with pixels in [0, 1]: of the rollout,
-      of the tokenizer alone (the least that the rollout can have), and of the first frame `repeated`. Accuracies of
+      of the tokenizer alone (the least that the rollout can have), and of the first frame `repeated`. Percents of
+      whole frames that are those of the tokenizer, of the rollout and of the first frame; and, of models that copy
+      tokens, which percentage of the next frame they copy. Accuracies of
       symbols are in percent, of the same, and of the extractor on the real frame (the most that a rollout can have).
       Percents of rewards and terminations that are right; and, for events, that is rewards other than 0 and
       terminations, how often they come, and how likely they are by the model on the real frames. The summary has means
@@ -145,6 +167,12 @@ def compare(
         "repeated_": np.broadcast_to(first, after.shape),
     }
     columns = {f"{name}error": (squared_error(frames, after, high), shown) for name, frames in seen.items()}
+    right = {"": found.frames, "repeated_": np.broadcast_to(found.tokenized[:, :1], after.shape)}
+    for name, frames in right.items():
+        whole = (frames == found.tokenized[:, 1:]).reshape(*shown.shape, -1).all(-1)
+        columns[f"{name}frames_percent"] = (100.0 * whole, shown)
+    if found.copied is not None:
+        columns["copied_percent"] = (100.0 * found.copied, shown)
     if read is not None:
         truth = real.symbols[:, :steps]
         for name, frames in {**seen, "real_": after}.items():

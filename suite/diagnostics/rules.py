@@ -192,7 +192,17 @@ def _go_on(
     """One dream, from where the imagined games are, and what the real ones make of its events."""
     policy, model = _policy(agent, learner, uniform), nnx.merge(agent.world_model_graph, world_model)
     start, horizon = games.imagined, agent.config.imagination.horizon
-    dream = Dream(model, agent.tokenizer, tokenizer, agent.spec, agent.tokens, horizon, start.observation, start.turn)
+    dream = Dream(
+        model,
+        agent.tokenizer,
+        tokenizer,
+        agent.spec,
+        agent.tokens,
+        horizon,
+        start.observation,
+        start.turn,
+        min_p=agent.config.imagination.min_p,
+    )
     player = play.start(policy, dream, key, burn_in=0)
     time_step = dataclasses.replace(player.time_step, first=start.first)
     player = dataclasses.replace(player, time_step=time_step, hidden_BH=games.hidden_BH)

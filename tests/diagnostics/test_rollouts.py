@@ -61,6 +61,7 @@ def perfect(real):
         reward_odds=odds,
         termination_odds=ENDED.astype(np.float32),
         codes=np.arange(4),
+        copied=np.full(REWARD.shape, 0.5, np.float32),
     )
 
 
@@ -68,8 +69,9 @@ def test_the_environment_itself(real, perfect):
     rows, summary = compare(real, perfect, TOKENS, 255, read)
     for row in (*rows, summary):
         assert row["error"] == row["tokenizer_error"] == 0
-        for name in ("symbols", "tokenizer_symbols", "real_symbols", "reward", "termination"):
+        for name in ("frames", "symbols", "tokenizer_symbols", "real_symbols", "reward", "termination"):
             assert row[f"{name}_percent"] == 100
+        assert row["copied_percent"] == 50
         for event in ("reward", "termination"):
             assert row[f"{event}_probability"] == row[f"{event}_frequency"]
     for event in ("reward", "termination"):
@@ -112,6 +114,15 @@ def test_a_constant(real, perfect):
     assert summary["reward_calibration_error"] == pytest.approx(25)
     assert summary["termination_calibration_error"] == pytest.approx(100 * (0.25 - 1 / 8))
     assert "codes_used" not in summary
+
+
+def test_whole_frames(real, perfect):
+    """Of the frames that count (see above) only the last one shows place 0."""
+    found = dataclasses.replace(perfect, frames=frames_of(np.zeros((3, 3), int)), copied=None)
+    rows, summary = compare(real, found, TOKENS, 255, None)
+    assert [row["frames_percent"] for row in rows] == pytest.approx([0, 0, 50])
+    assert [row["repeated_frames_percent"] for row in rows] == pytest.approx([100 / 3, 0, 0])
+    assert "copied_percent" not in summary
 
 
 def test_without_symbols_and_for_fewer_steps(real, perfect):
