@@ -91,7 +91,7 @@ def test_bad_runs(suite, never, name):
         (["list", "task"], "cannot list 'task'; did you mean 'tasks'?"),
         (["list"], "required: tasks|agents|presets"),
         (["describe", "craftax"], "unknown task 'craftax'; did you mean 'craftax_full'?"),
-        (["describe", "craftax_classic", "--agent", "m6"], "unknown agent 'm6'; did you mean 'm5'?"),
+        (["describe", "craftax_classic", "--agent", "m5x"], "unknown agent 'm5x'; did you mean 'm5'?"),
         (["describe", "craftax_classic", "tokenizer.patch=[70,5]"], "patches of 70x5 are larger than a frame of 63x63"),
         (["bench", "craftax_classic", "--preset", "x"], "unknown preset 'x'; valid: paper, small, smoke"),
         (["evaluate", "nowhere"], "nowhere is no run folder: it has no record.json"),
