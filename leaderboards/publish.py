@@ -15,7 +15,7 @@ from pathlib import Path
 import pandas as pd
 
 from leaderboards.boards import Standing, as_csv, boards, tables_digest
-from leaderboards.qualification import Refusal, evidence_files, examine, overrides
+from leaderboards.qualification import Refusal, evidence_files, examine, overrides, settings
 from leaderboards.results import Entry, entries_of, run_folders
 from suite.config import hash_of
 from suite.errors import UserError
@@ -129,9 +129,10 @@ def _examined(kept: list[Path], new: list[Path]) -> tuple[list[RunRecord], list[
             refusals.append(found)
         else:
             records.append(found)
-    seen: dict[tuple[str, str], list[RunRecord]] = {}
+    seen: dict[tuple[int, str, str], list[RunRecord]] = {}
     for record in records:
-        seen.setdefault((record.config.digest(), record.fields["protocol_hash"]), []).append(record)
+        run = (record.config.seed, hash_of(settings(record.config)), record.fields["protocol_hash"])
+        seen.setdefault(run, []).append(record)
     qualified = []
     for same in seen.values():
         different: list[RunRecord] = []

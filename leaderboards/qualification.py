@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -46,13 +47,30 @@ def examine(folder: Path) -> RunRecord | Refusal:
     return Refusal(folder, reasons) if reasons else record
 
 
+def settings(config: Config) -> dict[str, Any]:
+    """What makes a run this agent's, by dotted name: without what is `FREE`, and without what belongs to a part of the
+    program that the agent does not have. So an agent without a world model keeps its results when a preset's changes.
+    """
+    unused: tuple[str, ...] = ()
+    if not config.world_model.enabled:
+        unused += ("world_model.", "tokenizer.")
+    if not config.dreams:
+        unused += ("imagination.", "replay.")
+    needed = ("world_model.enabled", "imagination.world")  # which say that
+    return {
+        name: value
+        for name, value in dotted(config).items()
+        if not name.startswith(FREE) and (name in needed or not name.startswith(unused))
+    }
+
+
 def overrides(config: Config) -> tuple[str, ...]:
     """Fields, as "dotted.name=value", in which a run differs from its preset as it is today."""
     preset = dotted(registry.resolve(config.task, config.agent, config.preset))
     return tuple(
         f"{name}={json.dumps(value, separators=(',', ':'))}"
-        for name, value in dotted(config).items()
-        if value != preset[name] and not name.startswith(FREE)
+        for name, value in settings(config).items()
+        if value != preset[name]
     )
 
 

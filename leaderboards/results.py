@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from leaderboards.qualification import settings
 from leaderboards.scoring import main_score
 from suite import registry
-from suite.config import Config
+from suite.config import Config, hash_of
 from suite.errors import UserError
 from suite.interface.environment import EnvironmentSpec
 from suite.record import RunRecord
@@ -103,14 +104,13 @@ def entries_of(records: Iterable[RunRecord]) -> list[Entry]:
     groups: dict[tuple[str, str, str, str], list[RunRecord]] = {}
     for record in records:
         config = record.config
-        settings = dataclasses.replace(config, seed=0).digest()
-        key = (config.task, config.preset, record.fields["protocol_hash"], settings)
+        key = (config.task, config.preset, record.fields["protocol_hash"], hash_of(settings(config)))
         groups.setdefault(key, []).append(record)
 
     def place(item: tuple[tuple[str, str, str, str], list[RunRecord]]) -> tuple[str, str, str, int, str, str]:
-        (task, preset, protocol, settings), (first, *_) = item
+        (task, preset, protocol, same), (first, *_) = item
         agent = first.config.agent
-        return task, preset, protocol, ids.index(agent) if agent in ids else len(ids), agent, settings
+        return task, preset, protocol, ids.index(agent) if agent in ids else len(ids), agent, same
 
     return [
         Entry(tuple(sorted(group, key=lambda record: record.config.seed)))

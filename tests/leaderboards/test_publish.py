@@ -95,6 +95,24 @@ def test_rows_ranks_and_evidence(suite):
     assert suite("verify", "leaderboards")[0] == 0
 
 
+def test_what_an_agent_does_not_use_does_not_set_its_runs_apart(suite):
+    """A preset whose world model has changed: `mfrl` has none, and its earlier runs are still its preset's."""
+    write("mfrl", 0, overrides=["world_model.updates=7", "imagination.updates=7", "replay.capacity=9000"])
+    write("mfrl", 1)
+    write("oracle", 0, (1.0, 9.0), overrides=["world_model.updates=7"])
+    write("oracle", 1, (1.0, 9.0), overrides=["imagination.updates=7"])
+    assert suite("publish")[1].splitlines()[0] == "4 runs added, 0 refused; 4 runs in 3 entries"
+    table = board()
+    ours = table[table["measured_here"]].set_index(["agent", "overrides"])
+    assert ours.loc["mfrl", "seeds"].tolist() == [2] and ours.loc["mfrl"].index.isna().all()
+    assert ours.loc["mfrl", "rank"].tolist() == [1]
+    assert ours.loc["oracle"].index.fillna("").tolist() == ["", "imagination.updates=7"]
+    # The oracle's score is the best, but it learned from the simulator.
+    assert ours.loc["oracle", "rank"].isna().all() and ours.loc["oracle", "note"].str.contains("not ranked").all()
+    write("mfrl", 1, (2.0, 2.0), out="again", overrides=["tokenizer.updates=3"])
+    assert "duplicate seed 1" in suite("publish", "again")[2]
+
+
 def test_published_results_stand_beside_ours(suite):
     write()
     suite("publish")
