@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from suite.config import Config
+from suite.config import Config, WorldModelConfig
 from suite.overrides import apply_changes
 
 Part = Callable[[Config], dict[str, Any]]
@@ -21,10 +22,7 @@ PARTS: dict[str, Part] = {
     "local": lambda config: {"world_model.local_embedding": LOCAL_EMBEDDING},
     "action": lambda config: {"world_model.action_in_tokens": True},
     "min_p": lambda config: {"imagination.min_p": MIN_P},
-    "context": lambda config: {
-        "imagination.context": CONTEXT,
-        "world_model.sequence_length": config.world_model.sequence_length + CONTEXT,
-    },
+    "context": lambda config: _with_context(config.world_model),
 }
 
 
@@ -49,6 +47,17 @@ def oracle(config: Config) -> Config:
     It steps the simulator far more often than its budget of real steps says, so it is no rival of the others.
     """
     return apply_changes(config, {"world_model.enabled": False, "imagination.world": "game"})
+
+
+def _with_context(model: WorldModelConfig) -> dict[str, Any]:
+    """Sequences that are longer by the context, and so many fewer that a gradient step costs about the same."""
+    length = model.sequence_length + CONTEXT
+    each = math.ceil(model.sequences * model.sequence_length / length / model.minibatches)
+    return {
+        "imagination.context": CONTEXT,
+        "world_model.sequence_length": length,
+        "world_model.sequences": each * model.minibatches,
+    }
 
 
 def _with_parts(config: Config, parts: Mapping[str, Part]) -> Config:

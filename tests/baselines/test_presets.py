@@ -170,7 +170,7 @@ M6 = {
     "local": {"world_model.local_embedding": 16},
     "action": {"world_model.action_in_tokens": True},
     "min_p": {"imagination.min_p": 0.2},
-    "context": {"imagination.context": 3, "world_model.sequence_length": 23},
+    "context": {"imagination.context": 3, "world_model.sequence_length": 23, "world_model.sequences": 42},
 }
 
 
