@@ -14,6 +14,7 @@ Part = Callable[[Config], dict[str, Any]]
 LOCAL_EMBEDDING = 16  # numbers that the tokens around each one are embedded in
 CONTEXT = 3  # real frames before a dream's first: enough to tell how fast what moves
 MIN_P = 0.2
+TRUST = 0.7  # where models knew more of the rewards, dreams helped or did nothing; where they knew less, they did harm
 
 # Each part of M6 by name: what it changes of M5.
 PARTS: dict[str, Part] = {
@@ -23,15 +24,16 @@ PARTS: dict[str, Part] = {
     "action": lambda config: {"world_model.action_in_tokens": True},
     "min_p": lambda config: {"imagination.min_p": MIN_P},
     "context": lambda config: _with_context(config.world_model),
+    "trust": lambda config: {"imagination.trust": TRUST},
 }
 
 
 def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
-    Six parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
-    of the tokens around each one, the action added to every token, dreams without improbable tokens, and dreams that
-    know the frames before their first.
+    Seven parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
+    of the tokens around each one, the action added to every token, dreams without improbable tokens, dreams that know
+    the frames before their first, and no dreams while the model does not foresee rewards.
     """
     return _with_parts(config, PARTS)
 

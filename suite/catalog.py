@@ -277,6 +277,7 @@ AGENTS = (
             ("action", "whose action is a token and nothing more"),
             ("min_p", "that dreams improbable tokens too"),
             ("context", "whose dreams know no frame before their first"),
+            ("trust", "that dreams whatever its model knows of rewards"),
         )
     ),
     AgentEntry(

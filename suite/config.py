@@ -165,6 +165,10 @@ class ImaginationConfig:
     # Codes less likely than this share of the likeliest one are not dreamt: what is left of a softmax that training
     # has not emptied. 0: all are drawn as the model says.
     min_p: Rate = 0.0
+    # Dreams teach only in iterations in which the world model knows at least this share of what rewards hold
+    # (`world_model/reward_known`): a policy that learns from rewards that do not come is worse than one that does not
+    # dream. 0: always.
+    trust: Rate = 0.0
     start_step: NotNegative = 200_000  # T_BP: warmup
     horizon: Positive = 20  # T_WM
     num_envs: Positive = 48
@@ -234,10 +238,13 @@ class Config:
         """Real steps actually taken: `iterations * steps_per_iteration`, at most the budget."""
         return self.iterations * self.steps_per_iteration
 
-    def imagined_updates(self, steps: int) -> int:
-        """Imagined policy updates of the iteration that brings the run to `steps` real steps."""
+    def imagined_updates(self, steps: int, known: float | None = None) -> int:
+        """Imagined policy updates of the iteration that brings the run to `steps` real steps.
+
+        `known`: the share of what rewards hold that the world model knew in it, if that was measured.
+        """
         plan = self.imagination
-        if not self.dreams or steps < plan.start_step:
+        if not self.dreams or steps < plan.start_step or (known is not None and known < plan.trust):
             return 0
         if plan.schedule == "linear":
             return round(plan.updates * min(1.0, steps / self.protocol.steps))
@@ -284,6 +291,8 @@ def _problems(config: Config) -> Iterator[str]:
         yield f"environment.rollout_length={env.rollout_length} must be at least environment.burn_in={env.burn_in}"
     if dream.world == "game" and model.enabled:
         yield "imagination.world=game has no use for a world model: world_model.enabled=false"
+    if dream.world == "game" and dream.trust:
+        yield "imagination.world=game needs no trust, for its rewards are the true ones: imagination.trust=0"
     if dream.world == "model" and dream.horizon + dream.context > model.sequence_length:
         yield (
             f"imagination.horizon={dream.horizon} and imagination.context={dream.context} must together not exceed "

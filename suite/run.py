@@ -154,7 +154,7 @@ class _Training:
             with self._phase("world_model"):
                 world_model, found = agent.update_world_model(world_model, tokenizer, replay, keys[2])
                 metrics |= self._check("world_model", found)
-        updates = config.imagined_updates(self.steps)
+        updates = config.imagined_updates(self.steps, metrics.get("world_model/reward_known"))
         if updates:
             params = None if world_model is None else world_model.params
             with self._phase("imagine"):

@@ -110,6 +110,8 @@ class Agent:
         if self.config.world_model.enabled:
             phases["tokenizer"] = self.tokenizer.metrics
             phases["world_model"] = world_model_training.metrics_of(self.tokens, self.config.world_model)
+            if self.config.imagination.trust:
+                phases["world_model"] += ("reward_known",)
         if self.config.dreams:
             phases["imagine"] = IMAGINATION_METRICS
         return [f"{phase}/{metric}" for phase, metrics in phases.items() for metric in metrics]
@@ -235,7 +237,7 @@ class Agent:
                 ended_BT=batch.first[:, 1:],
                 turn_BT=batch.turn,
             )
-            return world_model_training.update(
+            learner, metrics = world_model_training.update(
                 config,
                 self.world_model_optimizer,
                 self.world_model_graph,
@@ -244,9 +246,14 @@ class Agent:
                 sequences,
                 dropout_key,
             )
+            return learner, (metrics, sequences.reward_BT if self.config.imagination.trust else None)
 
-        learner, metrics = jax.lax.scan(update, learner, jax.random.split(key, config.updates * config.minibatches))
-        return learner, jax.tree.map(jnp.mean, metrics)
+        keys = jax.random.split(key, config.updates * config.minibatches)
+        learner, (metrics, reward_NBT) = jax.lax.scan(update, learner, keys)
+        metrics = jax.tree.map(jnp.mean, metrics)
+        if reward_NBT is not None:
+            metrics["reward_known"] = world_model_training.known_share(self.tokens, metrics["reward_loss"], reward_NBT)
+        return learner, metrics
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def imagine(

@@ -196,6 +196,22 @@ def update(
     return WorldModelLearner(optax.apply_updates(learner.params, updates), state), metrics
 
 
+def known_share(spec: TokenSpec, reward_loss: jax.Array, reward_N: jax.Array) -> jax.Array:
+    """The share of what rewards hold that a model knows: 1 - its loss / the entropy of how often each reward comes.
+
+    1: it foresees every reward; 0: it knows no more than how often each comes; below 0: less than that.
+
+    Args:
+      spec: the token stream, for the classes of rewards.
+      reward_loss: nats a step, its mean over the steps of `reward_N`.
+      reward_N: float32 of any shape; the rewards that it was asked for. If all are alike there is nothing to know: 0.
+    """
+    class_N = spec.reward_to_class(reward_N.reshape(-1))
+    frequency_R = jax.nn.one_hot(class_N, len(spec.reward_classes)).mean(0)
+    entropy = jax.scipy.special.entr(frequency_R).sum()
+    return jnp.where(entropy > 0, 1 - reward_loss / jnp.where(entropy > 0, entropy, 1.0), 0.0)
+
+
 def cross_entropy(logits: jax.Array, target: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Nats of `target` [...] under `logits` [..., C], and whether no class is likelier than it (float32 0 or 1)."""
     # A masked sum instead of a gather: its gradient needs no scatter.

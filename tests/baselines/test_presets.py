@@ -91,6 +91,7 @@ MODEL_NOTES = {
     "world_model.local_embedding": 0,
     "world_model.action_in_tokens": False,
     "imagination.min_p": 0.0,
+    "imagination.trust": 0.0,
     "imagination.world": "model",
     "imagination.recent": 0,  # Algorithm 1 samples the whole buffer
     "imagination.context": 0,  # 24
@@ -171,6 +172,7 @@ M6 = {
     "action": {"world_model.action_in_tokens": True},
     "min_p": {"imagination.min_p": 0.2},
     "context": {"imagination.context": 3, "world_model.sequence_length": 23, "world_model.sequences": 42},
+    "trust": {"imagination.trust": 0.7},
 }
 
 
