@@ -62,6 +62,10 @@ class EvaluationSet:
         """Bool [N, T]: the frame that the step led to is the same episode's."""
         return np.cumsum(self.ended, axis=1) == 0
 
+    def after(self, steps: int) -> EvaluationSet:
+        """The same trajectories without their first `steps` steps."""
+        return EvaluationSet(**{name: array[:, steps:] for name, array in vars(self).items()})
+
 
 @dataclasses.dataclass(frozen=True)
 class Pairs:

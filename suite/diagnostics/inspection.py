@@ -56,7 +56,9 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
     out = out or Path(os.path.commonpath([folder.resolve() for folder in folders])) / "inspect"
     require_writable(out)
     config, spec = records[0].config, records[0].spec
-    real = evaluation_set.load(config.task, config.preset, reporter)
+    whole = evaluation_set.load(config.task, config.preset, reporter)
+    start = max(record.config.imagination.context for record in records)  # all rollouts begin with the same frames
+    real = whole.after(start)
     extractor = symbols.load(config.task, config.preset, reporter) if real.symbols.shape[-1] else None
     if extractor is not None:
         reporter.message(f"the symbol extractor reads {100 * extractor.accuracy:.2f} % of validation symbols right")
@@ -69,7 +71,7 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
         reporter.message(f"imagining {len(real.action)} rollouts of {name}")
         run = restore(record, reporter)
         world_model, tokenizer = run.model["world_model"], run.model["tokenizer"]
-        found[name] = imagine(run.agent, world_model, tokenizer, real, jax.random.key(0))
+        found[name] = imagine(run.agent, world_model, tokenizer, whole, jax.random.key(0), start)
         high = spec.observation.high
         table, summary = compare(real, found[name], run.agent.tokens, high, extractor)
         steps[name] = pd.DataFrame(table)

@@ -20,7 +20,7 @@ from flax import nnx
 from suite.agent.dyna import Agent
 from suite.diagnostics.evaluation_set import EvaluationSet
 from suite.interface.tokens import TokenizerState, TokenSpec
-from suite.world_model.imagination import Dream
+from suite.world_model.imagination import Context, Dream
 
 CHUNK = 32  # trajectories imagined together
 BINS = 10  # of probabilities, for calibration
@@ -58,34 +58,40 @@ class Rollouts:
 
 
 def imagine(
-    agent: Agent, world_model: nnx.State, tokenizer: TokenizerState, real: EvaluationSet, key: jax.Array
+    agent: Agent, world_model: nnx.State, tokenizer: TokenizerState, real: EvaluationSet, key: jax.Array, start: int = 0
 ) -> Rollouts:
     """Replays the actions of the evaluation set in a world model, its samples drawn as in training.
 
-    Rollouts are no longer than the model's training sequences: it has never seen more context.
+    A model whose dreams know the frames before their first knows them here too. With them, rollouts are no longer than
+    the model's training sequences: it has never seen more.
 
     Args:
       agent: of a single-agent task.
       world_model, tokenizer: parameters and state.
       real: the evaluation set.
       key: of the samples.
+      start: the frame that rollouts begin with; no fewer stand before it than the agent's dreams know.
     """
-    steps = min(real.action.shape[1], agent.config.world_model.sequence_length)
+    context = agent.config.imagination.context
+    assert start >= context
+    real = real.after(start - context)
+    steps = min(real.action.shape[1], agent.config.world_model.sequence_length) - context
+    seen = context + steps
     parts: list[list[np.ndarray]] = []
     copies: list[np.ndarray] = []
     used: set[int] = set()
-    for start in range(0, len(real.action), CHUNK):
-        frames = real.frames[start : start + CHUNK, : steps + 1]
-        action = real.action[start : start + CHUNK, :steps]
+    shown_NT = np.pad(real.after(context).frame_counted[:, :steps], ((0, 0), (1, 0)), constant_values=True)
+    for first in range(0, len(real.action), CHUNK):
+        frames = real.frames[first : first + CHUNK, : seen + 1]
+        action = real.action[first : first + CHUNK, :seen]
         missing = [(0, min(CHUNK, len(real.action)) - len(action))]  # one shape, one compilation
         padded = [np.pad(x, missing + [(0, 0)] * (x.ndim - 1), mode="edge") for x in (frames, action)]
-        found = _imagine(agent, world_model, tokenizer, *padded, jax.random.fold_in(key, start))
+        found = _imagine(agent, world_model, tokenizer, *padded, jax.random.fold_in(key, first))
         *arrays, copied, tokens = (np.asarray(x)[: len(action)] for x in jax.device_get(found))
         copies.append(copied)
         parts.append(arrays)
-        shown = np.pad(real.frame_counted[start : start + CHUNK, :steps], ((0, 0), (1, 0)), constant_values=True)
         if agent.tokenizer.num_codes:
-            used.update(np.unique(tokens[shown]).tolist())
+            used.update(np.unique(tokens[shown_NT[first : first + CHUNK]]).tolist())
     codes = np.array(sorted(used)) if agent.tokenizer.num_codes else None
     whole = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     shares = np.concatenate(copies) if agent.config.world_model.correspondence else None
@@ -101,8 +107,13 @@ def _imagine(
     action_NT: jax.Array,
     key: jax.Array,
 ) -> tuple[jax.Array, ...]:
-    """The fields of `Rollouts` in their order but for the last two: what is copied, and the real frames' tokens."""
-    model, horizon = nnx.merge(agent.world_model_graph, world_model), action_NT.shape[1]
+    """The fields of `Rollouts` in their order but for the last two: what is copied, and the real frames' tokens.
+
+    Of the frames and actions the first are those that the agent's dreams know besides; nothing is returned of them.
+    """
+    plan, model = agent.config.imagination, nnx.merge(agent.world_model_graph, world_model)
+    context, horizon = plan.context, action_NT.shape[1] - plan.context
+    known = Context(jnp.swapaxes(frames_NTO[:, :context], 0, 1), action_NT[:, :context].T) if context else None
     dream = Dream(
         model,
         agent.tokenizer,
@@ -110,8 +121,9 @@ def _imagine(
         agent.spec,
         agent.tokens,
         horizon,
-        frames_NTO[:, 0],
-        min_p=agent.config.imagination.min_p,
+        frames_NTO[:, context],
+        context=known,
+        min_p=plan.min_p,
     )
     start, _ = dream.reset(key)
 
@@ -120,10 +132,11 @@ def _imagine(
         state, seen = dream.step(step_key, state, action_N)
         return state, (seen.observation, seen.reward, seen.terminated)
 
-    _, imagined = jax.lax.scan(step, start, (jax.random.split(key, horizon), action_NT.T))
+    _, imagined = jax.lax.scan(step, start, (jax.random.split(key, horizon), action_NT[:, context:].T))
     tokens_NTL = agent.tokenizer.encode(tokenizer, frames_NTO)
-    hidden = model(tokens_NTL[:, :-1], action_NT)
-    copied_NT = jnp.zeros(action_NT.shape)
+    hidden = model(tokens_NTL[:, :-1], action_NT)[:, context:]
+    tokens_NTL = tokens_NTL[:, context:]
+    copied_NT = jnp.zeros(hidden.shape[:2])
     if model.gate_head is not None:
         copied_NT = 1 - jnp.exp(model.log_gate(hidden)[..., 0]).mean(-1)
     return (

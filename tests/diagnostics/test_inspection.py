@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from flax import nnx
 from PIL import Image
 
 from suite import checkpoint, registry
 from suite.agent.dyna import Agent
-from suite.diagnostics import evaluation_set, inspection, symbols
+from suite.diagnostics import evaluation_set, inspection, rollouts, symbols
 from suite.diagnostics.evaluation_set import Pairs, WithSymbols
 from suite.errors import UserError
 from suite.evaluation import agent_for, model_template
@@ -68,7 +69,7 @@ def untrained(out, task, agent):
     folder = begun(out, task, agent)
     state = agent_for(registry.resolve(task, agent, "smoke"), QUIET).init(jax.random.key(0))
     tokenizer = state.tokenizer
-    if agent == "m5":
+    if agent != "m5_continuous":
         codes_KP = jnp.zeros_like(tokenizer.codes_KP).at[1].set(255)
         tokenizer = dataclasses.replace(tokenizer, codes_KP=codes_KP, count=jnp.int32(2))
         with RunRecord.open(folder) as record:
@@ -178,6 +179,30 @@ def test_one_run_of_a_task_without_symbols(tmp_path):
     row = found["runs"]["m5"]
     assert row["error"] >= 0 and not [name for name in row if "symbols" in name or "extractor" in name]
     assert (folder / "inspect" / "curves.png").exists()
+
+
+def test_a_model_that_knows_what_came_before(tmp_path):
+    """Its rollouts begin where those of the others do, and its odds are of a model that sees the frames before."""
+    folders = [untrained(tmp_path, "unknown", agent) for agent in ("m5", "m6")]
+    inspection.inspect(folders, tmp_path / "out", QUIET)
+    steps = pd.read_csv(tmp_path / "out" / "steps.csv").set_index("run")
+    assert steps.step.m5.tolist() == steps.step.m6.tolist() == [1, 2, 3, 4]
+    assert steps.repeated_error.m5.tolist() == steps.repeated_error.m6.tolist()
+
+    run = inspection.restore(RunRecord.open(folders[1], lock=False), QUIET)
+    model, tokenizer = run.model["world_model"], run.model["tokenizer"]
+    real, context = evaluation_set.load("unknown", "smoke", QUIET), run.agent.config.imagination.context
+    found = rollouts.imagine(run.agent, model, tokenizer, real, jax.random.key(0), start=context)
+    tokens_NTL = run.agent.tokenizer.encode(tokenizer, real.frames)
+    whole = nnx.merge(run.agent.world_model_graph, model)
+    length = context + found.steps
+    hidden = whole(tokens_NTL[:, :length], real.action[:, :length])
+    np.testing.assert_allclose(
+        found.reward_odds, jax.nn.softmax(whole.reward_logits(hidden))[:, context:], rtol=1e-4, atol=1e-6
+    )
+    np.testing.assert_array_equal(
+        found.tokenized, run.agent.tokenizer.decode(tokenizer, tokens_NTL[:, context : length + 1])
+    )
 
 
 def test_what_cannot_be_inspected(runs, tmp_path):
