@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from suite.config import Config, WorldModelConfig
+from suite.config import Config
 from suite.overrides import apply_changes
 
 Part = Callable[[Config], dict[str, Any]]
 
 LOCAL_EMBEDDING = 16  # numbers that the tokens around each one are embedded in
-CONTEXT = 3  # real frames before a dream's first: enough to tell how fast what moves
+AGES = 15  # longer than the timers of MinAtar's games
 MIN_P = 0.2
+MUON_LEARNING_RATE = 0.003
 TRUST = 0.7  # where models knew more of the rewards, dreams helped or did nothing; where they knew less, they did harm
 
 # Each part of M6 by name: what it changes of M5.
@@ -23,7 +23,8 @@ PARTS: dict[str, Part] = {
     "local": lambda config: {"world_model.local_embedding": LOCAL_EMBEDDING},
     "action": lambda config: {"world_model.action_in_tokens": True},
     "min_p": lambda config: {"imagination.min_p": MIN_P},
-    "context": lambda config: _with_context(config.world_model),
+    "ages": lambda config: {"world_model.ages": _ages(config)},
+    "muon": lambda config: {"world_model.optimizer": "muon", "world_model.learning_rate": MUON_LEARNING_RATE},
     "trust": lambda config: {"imagination.trust": TRUST},
 }
 
@@ -31,9 +32,9 @@ PARTS: dict[str, Part] = {
 def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
-    Seven parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
-    of the tokens around each one, the action added to every token, dreams without improbable tokens, dreams that know
-    the frames before their first, and no dreams while the model does not foresee rewards.
+    Eight parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
+    of the tokens around each one, the action added to every token, dreams without improbable tokens, the age of every
+    token, another optimizer of the model, and no dreams while the model does not foresee rewards.
     """
     return _with_parts(config, PARTS)
 
@@ -51,15 +52,9 @@ def oracle(config: Config) -> Config:
     return apply_changes(config, {"world_model.enabled": False, "imagination.world": "game"})
 
 
-def _with_context(model: WorldModelConfig) -> dict[str, Any]:
-    """Sequences that are longer by the context, and so many fewer that a gradient step costs about the same."""
-    length = model.sequence_length + CONTEXT
-    each = math.ceil(model.sequences * model.sequence_length / length / model.minibatches)
-    return {
-        "imagination.context": CONTEXT,
-        "world_model.sequence_length": length,
-        "world_model.sequences": each * model.minibatches,
-    }
+def _ages(config: Config) -> int:
+    """`AGES`, or what the first iteration's steps leave room for before a training sequence."""
+    return min(AGES, config.environment.rollout_length - config.world_model.sequence_length - 1)
 
 
 def _with_parts(config: Config, parts: Mapping[str, Part]) -> Config:

@@ -276,7 +276,8 @@ AGENTS = (
             ("local", "that embeds each token alone"),
             ("action", "whose action is a token and nothing more"),
             ("min_p", "that dreams improbable tokens too"),
-            ("context", "whose dreams know no frame before their first"),
+            ("ages", "that does not know how long anything has been where it is"),
+            ("muon", "whose world model learns by Adam, as in m5"),
             ("trust", "that dreams whatever its model knows of rewards"),
         )
     ),

@@ -131,12 +131,15 @@ class WorldModelConfig:
     dropout: Rate = 0.1  # embedding, attention and residual
     initial_std: PositiveFloat = 0.02  # of every kernel and embedding, GPT-2's; narrow models learn faster from more
     positions: Literal["flat", "grid"] = "flat"  # RoPE over the token index, or over (time, row, column): note 20
-    # This and the next three are not the paper's (docs/agents.md): copy tokens from near their place, or make them new.
+    # This and the next four are not the paper's (docs/agents.md): copy tokens from near their place, or make them new.
     correspondence: bool = False
     correspondence_radius: NotNegative = 1  # of the square that is copied from; symbols: their own place alone
     # Numbers in a further embedding of the 3x3 tokens around each, of which its own embedding gets a sum; 0: none.
     local_embedding: NotNegative = 0
     action_in_tokens: bool = False  # an embedding of the action is added to every token of its block
+    # The model is told every token's age, for how many steps its place has shown it, up to so many. 0: it is not told.
+    # Only where tokens are patches: symbols of games that people play have no timers.
+    ages: NotNegative = 0
     # Symbols are embedded by value and place, since the same value means different things in different places; the
     # paper does not say. false: by value alone, as patches are.
     symbol_places: bool = True
@@ -148,6 +151,8 @@ class WorldModelConfig:
     reward_weight: NotNegativeFloat = 1.0  # of the reward and termination losses (MinAtar: 10)
     learning_rate: PositiveFloat = 1e-3
     adam_eps: PositiveFloat = 1e-5
+    # Muon (Jordan et al. 2024) for the matrices between hidden features, Adam for the rest; the paper has Adam alone.
+    optimizer: Literal["adam", "muon"] = "adam"
     max_grad_norm: PositiveFloat = 0.5
     compute_type: ComputeType = "auto"
 
@@ -282,10 +287,11 @@ def _problems(config: Config) -> Iterator[str]:
         yield f"world_model.reward_classes={model.reward_classes} must ascend"
     if config.dreams and config.replay.capacity < 2 * config.steps_per_iteration:
         yield f"replay.capacity={config.replay.capacity} must hold two iterations ({2 * config.steps_per_iteration})"
-    if model.enabled and env.rollout_length <= model.sequence_length:
+    if model.enabled and env.rollout_length <= model.sequence_length + model.ages:
+        ages = f" + world_model.ages={model.ages}" if model.ages else ""
         yield (
             f"environment.rollout_length={env.rollout_length} must exceed "
-            f"world_model.sequence_length={model.sequence_length}"
+            f"world_model.sequence_length={model.sequence_length}{ages}"
         )
     if env.rollout_length < env.burn_in:
         yield f"environment.rollout_length={env.rollout_length} must be at least environment.burn_in={env.burn_in}"
@@ -302,11 +308,12 @@ def _problems(config: Config) -> Iterator[str]:
         yield f"world_model.embed_dim / world_model.heads = {model.embed_dim / model.heads:g} must be even (RoPE)"
     if config.policy.kind == "moon" and (config.policy.rnn_size or not config.policy.embedding_size):
         yield "policy.kind=moon has no memory and an embedding: policy.rnn_size=0, and policy.embedding_size above 0"
-    if model.correspondence and (not model.block_teacher_forcing or config.tokenizer.kind == "continuous"):
-        yield (
-            "world_model.correspondence=true needs world_model.block_teacher_forcing=true and a tokenizer.kind whose "
-            "tokens are codes"
-        )
+    for name, used in (("correspondence=true", model.correspondence), (f"ages={model.ages}", model.ages)):
+        if used and (not model.block_teacher_forcing or config.tokenizer.kind == "continuous"):
+            yield (
+                f"world_model.{name} needs world_model.block_teacher_forcing=true and a tokenizer.kind whose "
+                "tokens are codes"
+            )
     if config.tokenizer.kind == "continuous" and not model.block_teacher_forcing:
         yield "tokenizer.kind=continuous needs world_model.block_teacher_forcing=true: its tokens are no codes"
     if config.protocol.steps < config.steps_per_iteration:

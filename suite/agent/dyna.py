@@ -27,7 +27,8 @@ from suite.policy import ppo
 from suite.policy.actor_critic import make_policy
 from suite.tokenizers import make_tokenizer
 from suite.world_model import training as world_model_training
-from suite.world_model.imagination import Context, Dream
+from suite.world_model.ages import ages_of
+from suite.world_model.imagination import Dream, Past
 from suite.world_model.transformer import WorldModel
 
 Metrics = dict[str, jax.Array]
@@ -115,6 +116,16 @@ class Agent:
         if self.config.dreams:
             phases["imagine"] = IMAGINATION_METRICS
         return [f"{phase}/{metric}" for phase, metrics in phases.items() for metric in metrics]
+
+    @property
+    def ages(self) -> int:
+        """The highest age of a token that the world model is told; 0: it is told none."""
+        return self.config.world_model.ages if self.config.world_model.enabled and self.tokens.spatial else 0
+
+    @property
+    def past(self) -> int:
+        """How many real frames before a dream's first one its world model is told of."""
+        return max(self.config.imagination.context, self.ages)
 
     def _new_policy(self, rngs: nnx.Rngs) -> Any:
         return make_policy(self.config.policy, self.spec.observation, self.spec.num_actions, rngs)
@@ -226,16 +237,20 @@ class Agent:
 
         def update(learner, key):
             sample_key, dropout_key = jax.random.split(key)
-            length = config.sequence_length + 1
+            length = self.ages + config.sequence_length + 1
             batch = self.replay.sample(replay, sample_key, config.sequences // config.minibatches, length)
+            tokens_BTL = encode_frame(self.tokenizer, tokenizer, batch.observation, batch.turn)
+            age_BTL = ages_of(tokens_BTL, self.ages) if self.ages else None
+            batch, tokens_BTL, age_BTL = jax.tree.map(lambda x: x[:, self.ages :], (batch, tokens_BTL, age_BTL))
             action_BT = batch.action if batch.turn is None else stream_action(batch.turn, batch.action)
             sequences = world_model_training.Sequences(
-                tokens_BTL=encode_frame(self.tokenizer, tokenizer, batch.observation, batch.turn),
+                tokens_BTL=tokens_BTL,
                 action_BT=action_BT[:, :-1],
                 reward_BT=batch.reward[:, :-1],
                 terminated_BT=batch.terminated[:, :-1],
                 ended_BT=batch.first[:, 1:],
                 turn_BT=batch.turn,
+                age_BTL=None if age_BTL is None else age_BTL[:, :-1],
             )
             learner, metrics = world_model_training.update(
                 config,
@@ -296,7 +311,7 @@ class Agent:
         """One imagined rollout from replayed frames, the memory refreshed on the M frames before each (note 12)."""
         plan, policy, memory = self.config.imagination, self._policy(learner), self.config.environment.burn_in
         sample_key, start_key, rollout_key = jax.random.split(key, 3)
-        before = max(memory, plan.context)
+        before = max(memory, self.past)
         past = self.replay.sample(replay, sample_key, plan.num_envs, before + 1, plan.recent)
         past = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), past)
         dream = self._dreamt_world(model, tokenizer, past)
@@ -324,7 +339,7 @@ class Agent:
         if model is None:
             game = Batched(self.batched.environment, plan.num_envs)
             return game.resumed(start.state, start.observation, start.first, start.turn)
-        context = jax.tree.map(lambda x: x[len(past.first) - 1 - plan.context : -1], past)
+        before = jax.tree.map(lambda x: x[len(past.first) - 1 - self.past : -1], past)
         return Dream(
             model,
             self.tokenizer,
@@ -334,7 +349,8 @@ class Agent:
             plan.horizon,
             start.observation,
             start.turn,
-            context=Context(context.observation, context.action, context.turn) if plan.context else None,
+            past=Past(before.observation, before.action, before.turn) if self.past else None,
+            context=plan.context,
             min_p=plan.min_p,
         )
 

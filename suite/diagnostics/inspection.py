@@ -57,7 +57,8 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
     require_writable(out)
     config, spec = records[0].config, records[0].spec
     whole = evaluation_set.load(config.task, config.preset, reporter)
-    start = max(record.config.imagination.context for record in records)  # all rollouts begin with the same frames
+    runs = [restore(record, reporter) for record in records]
+    start = max(run.agent.past for run in runs)  # all rollouts begin with the same frames
     real = whole.after(start)
     extractor = symbols.load(config.task, config.preset, reporter) if real.symbols.shape[-1] else None
     if extractor is not None:
@@ -67,9 +68,8 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
     grid = len(spec.observation.shape) == 3
     found: dict[str, Rollouts] = {}
     rows, steps, codes = {}, {}, {}
-    for record, name in zip(records, _names(records), strict=True):
+    for record, run, name in zip(records, runs, _names(records), strict=True):
         reporter.message(f"imagining {len(real.action)} rollouts of {name}")
-        run = restore(record, reporter)
         world_model, tokenizer = run.model["world_model"], run.model["tokenizer"]
         found[name] = imagine(run.agent, world_model, tokenizer, whole, jax.random.key(0), start)
         high = spec.observation.high

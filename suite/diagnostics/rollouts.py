@@ -20,7 +20,8 @@ from flax import nnx
 from suite.agent.dyna import Agent
 from suite.diagnostics.evaluation_set import EvaluationSet
 from suite.interface.tokens import TokenizerState, TokenSpec
-from suite.world_model.imagination import Context, Dream
+from suite.world_model.ages import ages_of
+from suite.world_model.imagination import Dream, Past
 
 CHUNK = 32  # trajectories imagined together
 BINS = 10  # of probabilities, for calibration
@@ -72,15 +73,16 @@ def imagine(
       key: of the samples.
       start: the frame that rollouts begin with; no fewer stand before it than the agent's dreams know.
     """
-    context = agent.config.imagination.context
-    assert start >= context
-    real = real.after(start - context)
-    steps = min(real.action.shape[1], agent.config.world_model.sequence_length) - context
-    seen = context + steps
+    past = agent.past
+    assert start >= past
+    real = real.after(start - past)
+    longest = agent.config.world_model.sequence_length - agent.config.imagination.context
+    steps = min(real.action.shape[1] - past, longest)
+    seen = past + steps
     parts: list[list[np.ndarray]] = []
     copies: list[np.ndarray] = []
     used: set[int] = set()
-    shown_NT = np.pad(real.after(context).frame_counted[:, :steps], ((0, 0), (1, 0)), constant_values=True)
+    shown_NT = np.pad(real.after(past).frame_counted[:, :steps], ((0, 0), (1, 0)), constant_values=True)
     for first in range(0, len(real.action), CHUNK):
         frames = real.frames[first : first + CHUNK, : seen + 1]
         action = real.action[first : first + CHUNK, :seen]
@@ -112,8 +114,8 @@ def _imagine(
     Of the frames and actions the first are those that the agent's dreams know besides; nothing is returned of them.
     """
     plan, model = agent.config.imagination, nnx.merge(agent.world_model_graph, world_model)
-    context, horizon = plan.context, action_NT.shape[1] - plan.context
-    known = Context(jnp.swapaxes(frames_NTO[:, :context], 0, 1), action_NT[:, :context].T) if context else None
+    past, horizon = agent.past, action_NT.shape[1] - agent.past
+    known = Past(jnp.swapaxes(frames_NTO[:, :past], 0, 1), action_NT[:, :past].T) if past else None
     dream = Dream(
         model,
         agent.tokenizer,
@@ -121,8 +123,9 @@ def _imagine(
         agent.spec,
         agent.tokens,
         horizon,
-        frames_NTO[:, context],
-        context=known,
+        frames_NTO[:, past],
+        past=known,
+        context=plan.context,
         min_p=plan.min_p,
     )
     start, _ = dream.reset(key)
@@ -132,10 +135,12 @@ def _imagine(
         state, seen = dream.step(step_key, state, action_N)
         return state, (seen.observation, seen.reward, seen.terminated)
 
-    _, imagined = jax.lax.scan(step, start, (jax.random.split(key, horizon), action_NT[:, context:].T))
+    _, imagined = jax.lax.scan(step, start, (jax.random.split(key, horizon), action_NT[:, past:].T))
     tokens_NTL = agent.tokenizer.encode(tokenizer, frames_NTO)
-    hidden = model(tokens_NTL[:, :-1], action_NT)[:, context:]
-    tokens_NTL = tokens_NTL[:, context:]
+    read = slice(past - plan.context, -1)
+    age_NTL = ages_of(tokens_NTL, agent.ages)[:, read] if agent.ages else None
+    hidden = model(tokens_NTL[:, read], action_NT[:, past - plan.context :], age_BTL=age_NTL)[:, plan.context :]
+    tokens_NTL = tokens_NTL[:, past:]
     copied_NT = jnp.zeros(hidden.shape[:2])
     if model.gate_head is not None:
         copied_NT = 1 - jnp.exp(model.log_gate(hidden)[..., 0]).mean(-1)

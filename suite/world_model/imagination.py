@@ -12,32 +12,37 @@ from flax import struct
 from suite.interface.environment import EnvironmentSpec, TimeStep
 from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec, decode_frame, encode_frame
 from suite.interface.turns import CHANCE, Turn, stream_action
+from suite.world_model.ages import ages_of, next_ages
 from suite.world_model.heads import TurnLogits, filled_odds
 from suite.world_model.transformer import Cache, WorldModel
 
 
 @struct.dataclass
 class DreamState:
-    """The cache of all blocks before this frame, its tokens (int32 [B, L]) and, in a game, whose turn it is."""
+    """The cache of all blocks before this frame, its tokens (int32 [B, L]) and, in a game, whose turn it is.
+
+    Where the model is told ages, also those of the tokens (int32 [B, L]).
+    """
 
     cache: Cache
     tokens_BL: jax.Array
     turn_B: Turn | None = None
+    age_BL: jax.Array | None = None
 
 
 @struct.dataclass
-class Context:
-    """C real steps that lead to a dream's start frames, time-major, oldest first.
+class Past:
+    """P real steps that lead to a dream's start frames, time-major, oldest first.
 
     Attributes:
-      observation_CBO: uint8.
-      action_CB: int32, taken on them, in the player's own numbering.
-      turn_CB: whose turns they were; None for single-agent tasks.
+      observation_PBO: uint8.
+      action_PB: int32, taken on them, in the player's own numbering.
+      turn_PB: whose turns they were; None for single-agent tasks.
     """
 
-    observation_CBO: jax.Array
-    action_CB: jax.Array
-    turn_CB: Turn | None = None
+    observation_PBO: jax.Array
+    action_PB: jax.Array
+    turn_PB: Turn | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +62,8 @@ class Dream:
       horizon: T_WM, steps.
       start_observation_BO: uint8; real frames. Callers that know what came before them burn the policy's memory in.
       start_turn_B: whose turn it is there; None for single-agent tasks.
-      context: real steps before them that the model sees too; None: its view begins with the start frames (note 24).
+      past: real steps before them, at least as many as the context and, to tell ages by, as the model's highest age.
+      context: how many of the last of these the model reads; 0: its view begins with the start frames (note 24).
       min_p: codes less likely than this share of the likeliest are not drawn.
     """
 
@@ -69,7 +75,8 @@ class Dream:
     horizon: int
     start_observation_BO: jax.Array
     start_turn_B: Turn | None = None
-    context: Context | None = None
+    past: Past | None = None
+    context: int = 0
     min_p: float = 0.0
 
     @property
@@ -83,21 +90,27 @@ class Dream:
         turn_B = self.start_turn_B
         tokens_BL = encode_frame(self.tokenizer, self.tokenizer_state, self.start_observation_BO, turn_B)
         never_B = jnp.zeros((self.num_envs,), bool)
-        cache = self._remember()
+        cache, age_BL = self._remember(tokens_BL)
         time_step = _time_step(self.start_observation_BO, jnp.zeros((self.num_envs,), jnp.float32), never_B, turn_B)
-        return DreamState(cache, tokens_BL, turn_B), time_step
+        return DreamState(cache, tokens_BL, turn_B, age_BL), time_step
 
-    def _remember(self) -> Cache:
-        """A cache with room for the dream, and what the model saw before its start frames."""
-        if self.context is None:
-            return self.model.init_cache(self.num_envs, self.horizon)
-        seen = self.context
-        turn_CB, action_CB = seen.turn_CB, seen.action_CB
-        tokens_CBL = encode_frame(self.tokenizer, self.tokenizer_state, seen.observation_CBO, turn_CB)
-        if turn_CB is not None:
-            action_CB = stream_action(turn_CB, action_CB)
-        cache = self.model.init_cache(self.num_envs, self.horizon + len(action_CB))
-        return self.model.remember(cache, tokens_CBL.swapaxes(0, 1), action_CB.swapaxes(0, 1))
+    def _remember(self, start_BL: jax.Array) -> tuple[Cache, jax.Array | None]:
+        """A cache with room for the dream and what the model reads before its start frames; their tokens' ages."""
+        cache = self.model.init_cache(self.num_envs, self.context + self.horizon)
+        if self.past is None:
+            return cache, None
+        turn_PB, action_PB = self.past.turn_PB, self.past.action_PB
+        tokens_PBL = encode_frame(self.tokenizer, self.tokenizer_state, self.past.observation_PBO, turn_PB)
+        if turn_PB is not None:
+            action_PB = stream_action(turn_PB, action_PB)
+        tokens_BPL, action_BP, age_BPL = tokens_PBL.swapaxes(0, 1), action_PB.swapaxes(0, 1), None
+        if self.model.ages:
+            age_BPL = ages_of(jnp.concatenate([tokens_BPL, start_BL[:, None]], axis=1), self.model.ages)
+        if self.context:
+            read = slice(-self.context, None)
+            ages = None if age_BPL is None else age_BPL[:, :-1][:, read]
+            cache = self.model.remember(cache, tokens_BPL[:, read], action_BP[:, read], ages)
+        return cache, None if age_BPL is None else age_BPL[:, -1]
 
     def step(self, key: jax.Array, state: DreamState, action_B: jax.Array) -> tuple[DreamState, TimeStep]:
         """Samples reward, termination, the next frame's tokens and turn, given everything since the start frame."""
@@ -107,7 +120,7 @@ class Dream:
         stream_action_B = action_B if turn_B is None else stream_action(turn_B, action_B)
         valid_K = self.tokenizer.valid_codes(self.tokenizer_state)
         cache, hidden_BSD, tokens_BL = next_frame(
-            token_key, self.model, state.cache, state.tokens_BL, stream_action_B, valid_K, self.min_p
+            token_key, self.model, state.cache, state.tokens_BL, stream_action_B, valid_K, self.min_p, state.age_BL
         )
         reward_class_B = jax.random.categorical(reward_key, self.model.reward_logits(hidden_BSD, seat_B))
         terminated_B = jax.random.categorical(termination_key, self.model.termination_logits(hidden_BSD)) == 1
@@ -115,7 +128,10 @@ class Dream:
         if seat_B is not None and theirs_BO is not None:
             turn_B = next_turn(jax.random.fold_in(key, 3), self.model.turn_logits(hidden_BSD), seat_B, theirs_BO)
         time_step = _time_step(observation_BO, self.tokens.class_to_reward(reward_class_B), terminated_B, turn_B)
-        return DreamState(cache, tokens_BL, turn_B), time_step
+        age_BL = state.age_BL
+        if age_BL is not None:
+            age_BL = next_ages(age_BL, state.tokens_BL, tokens_BL, self.model.ages)
+        return DreamState(cache, tokens_BL, turn_B, age_BL), time_step
 
 
 def next_frame(
@@ -126,9 +142,10 @@ def next_frame(
     action_B: jax.Array,
     valid_K: jax.Array,
     min_p: float = 0.0,
+    age_BL: jax.Array | None = None,
 ) -> tuple[Cache, jax.Array, jax.Array]:
     """The cache with this frame and action, their hidden states [B, S, D], and the next frame's tokens [B, L]."""
-    cache, hidden_BSD = model.step(cache, tokens_BL, action_B)
+    cache, hidden_BSD = model.step(cache, tokens_BL, action_B, age_BL)
     if not model.config.block_teacher_forcing:
         next_BL, _ = sample_one_by_one(key, model, cache, hidden_BSD[:, -1], valid_K)
     elif model.token_size:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import nnx, struct
+from optax.contrib import MuonDimensionNumbers
 
 from suite.config import WorldModelConfig
 from suite.interface.tokens import TokenSpec
@@ -50,6 +51,7 @@ class Sequences:
       terminated_BT: bool; the episode ended there, and frame t + 1 belongs to the next one.
       ended_BT: bool; terminated or truncated; None: terminated. Only `mask_after_done` looks at it.
       turn_BT: whose turn it is at each of the T + 1 frames; None for single-agent tasks.
+      age_BTL: int32 [B, T, L]; ages of all tokens but the last frame's, for a model that is told them; else None.
     """
 
     tokens_BTL: jax.Array
@@ -58,6 +60,7 @@ class Sequences:
     terminated_BT: jax.Array
     ended_BT: jax.Array | None = None
     turn_BT: Turn | None = None
+    age_BTL: jax.Array | None = None
 
 
 @struct.dataclass
@@ -69,10 +72,34 @@ class WorldModelLearner:
 
 
 def make_optimizer(config: WorldModelConfig) -> optax.GradientTransformation:
-    """Adam after clipping the gradient's global norm (fidelity note 23)."""
-    return optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate, eps=config.adam_eps)
-    )
+    """Adam after clipping the gradient's global norm (fidelity note 23), or Muon in its place."""
+    optimizer = optax.adam(config.learning_rate, eps=config.adam_eps)
+    if config.optimizer == "muon":
+        optimizer = optax.contrib.muon(
+            config.learning_rate,
+            eps=config.adam_eps,
+            consistent_rms=0.2,  # steps of Adam's size, so that one learning rate serves both
+            muon_weight_dimension_numbers=_hidden_matrices,
+        )
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optimizer)
+
+
+def _hidden_matrices(params: nnx.State) -> Any:
+    """Which axes of which parameters Muon makes orthogonal; None: a parameter of Adam's.
+
+    Those of the layers' matrices, which are stacked, and of the heads' first ones. Embeddings, what logits are read
+    off, biases and norms are left to Adam, as is usual.
+    """
+
+    def axes(path: Any, array: jax.Array) -> MuonDimensionNumbers | None:
+        name = jax.tree_util.keystr(path)
+        if "layers" in name and array.ndim == 3:
+            return MuonDimensionNumbers(reduction_axis=1, output_axis=2)
+        if "hidden" in name and array.ndim == 2:
+            return MuonDimensionNumbers(reduction_axis=0, output_axis=1)
+        return None
+
+    return jax.tree_util.tree_map_with_path(axes, params)
 
 
 def metrics_of(spec: TokenSpec, config: WorldModelConfig) -> tuple[str, ...]:
@@ -99,7 +126,7 @@ def losses(
     frame, following = sequences.tokens_BTL[:, :-1], sequences.tokens_BTL[:, 1:]
     step_weight_BT, token_weight_BT = _weights(sequences, config.mask_after_done)
     if config.block_teacher_forcing:
-        hidden_BTSD = model(frame, sequences.action_BT, dropout_key)
+        hidden_BTSD = model(frame, sequences.action_BT, dropout_key, sequences.age_BTL)
         target_BTL, before_BTL = following, frame
         weight_BTL = jnp.broadcast_to(token_weight_BT[..., None], frame.shape[:3])
         token_loss_BTL, correct_BTL, copied_BTL = _token_losses(model, hidden_BTSD, target_BTL, frame)
@@ -190,7 +217,7 @@ def update(
         return losses(nnx.merge(graphdef, params), sequences, config, spec, key)
 
     (value, metrics), grads = jax.value_and_grad(loss, has_aux=True)(learner.params)
-    with jax.numpy_dtype_promotion("standard"):  # Optax's Adam mixes int32 and float
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # Optax mixes both
         updates, state = optimizer.update(grads, learner.optimizer, learner.params)
     metrics |= {"loss": value, "gradient_norm": optax.tree.norm(grads)}
     return WorldModelLearner(optax.apply_updates(learner.params, updates), state), metrics

@@ -129,13 +129,24 @@ class WorldModel(nnx.Module):
         self.token_action_embedding = (
             nnx.Embed(tokens.num_actions, width, embedding_init=init, rngs=rngs) if config.action_in_tokens else None
         )
+        self.ages = config.ages if tokens.spatial else 0
+        self.age_embedding = nnx.Embed(self.ages + 1, width, embedding_init=init, rngs=rngs) if self.ages else None
 
-    def __call__(self, tokens_BTL: jax.Array, action_BT: jax.Array, dropout_key: jax.Array | None = None) -> jax.Array:
-        """Hidden states [B, T, S, D] (float32) of whole sequences; without `dropout_key` nothing is dropped."""
+    def __call__(
+        self,
+        tokens_BTL: jax.Array,
+        action_BT: jax.Array,
+        dropout_key: jax.Array | None = None,
+        age_BTL: jax.Array | None = None,
+    ) -> jax.Array:
+        """Hidden states [B, T, S, D] (float32) of whole sequences; without `dropout_key` nothing is dropped.
+
+        Here and below, `age_BTL` are the tokens' ages, for a model that is told them.
+        """
         batch, steps = action_BT.shape
         rate = self.config.dropout
         embedding_key, layer_key = _split(dropout_key, 2)
-        x = self._embed(tokens_BTL, action_BT).reshape(batch, steps * self.block, -1)
+        x = self._embed(tokens_BTL, action_BT, age_BTL).reshape(batch, steps * self.block, -1)
         position_SA = self._positions(jnp.arange(steps * self.block))
         graphdef, layers = nnx.split(self.layers)
 
@@ -227,13 +238,17 @@ class WorldModel(nnx.Module):
         shape = (self.config.layers, batch, heads, blocks * self.block, width // heads)
         return Cache(jnp.zeros(shape, self.dtype), jnp.zeros(shape, self.dtype), jnp.int32(0))
 
-    def step(self, cache: Cache, tokens_BL: jax.Array, action_B: jax.Array) -> tuple[Cache, jax.Array]:
+    def step(
+        self, cache: Cache, tokens_BL: jax.Array, action_B: jax.Array, age_BL: jax.Array | None = None
+    ) -> tuple[Cache, jax.Array]:
         """Appends one block to the cache; its hidden states [B, S, D] equal those of the whole sequence's pass."""
-        return self._append(cache, self._embed(tokens_BL, action_B))
+        return self._append(cache, self._embed(tokens_BL, action_B, age_BL))
 
-    def remember(self, cache: Cache, tokens_BCL: jax.Array, action_BC: jax.Array) -> Cache:
+    def remember(
+        self, cache: Cache, tokens_BCL: jax.Array, action_BC: jax.Array, age_BCL: jax.Array | None = None
+    ) -> Cache:
         """Appends C blocks to the cache, all at once."""
-        x_BCSD = self._embed(tokens_BCL, action_BC)
+        x_BCSD = self._embed(tokens_BCL, action_BC, age_BCL)
         cache, _ = self._append(cache, x_BCSD.reshape(len(x_BCSD), -1, x_BCSD.shape[-1]))
         return cache
 
@@ -270,7 +285,7 @@ class WorldModel(nnx.Module):
     def _positions(self, index_S: jax.Array) -> jax.Array:
         return token_positions(self.config.positions, index_S, self.block, self.grid)
 
-    def _embed(self, tokens: jax.Array, action: jax.Array) -> jax.Array:
+    def _embed(self, tokens: jax.Array, action: jax.Array, age: jax.Array | None) -> jax.Array:
         if self.codes_per_place:
             places = self.codes_per_place * jnp.arange(tokens.shape[-1])
             tokens = tokens + places.reshape((1,) * (tokens.ndim - 1) + (-1,))
@@ -280,6 +295,8 @@ class WorldModel(nnx.Module):
             x = x + self.local_mix(around.reshape(*tokens.shape, -1))
         if self.token_action_embedding is not None:
             x = x + self.token_action_embedding(action)[..., None, :]
+        if self.age_embedding is not None and age is not None:
+            x = x + self.age_embedding(age)
         return jnp.concatenate([x, self.action_embedding(action)[..., None, :]], axis=-2)
 
 

@@ -90,6 +90,8 @@ MODEL_NOTES = {
     "world_model.correspondence_radius": 1,
     "world_model.local_embedding": 0,
     "world_model.action_in_tokens": False,
+    "world_model.ages": 0,
+    "world_model.optimizer": "adam",  # 23
     "imagination.min_p": 0.0,
     "imagination.trust": 0.0,
     "imagination.world": "model",
@@ -171,7 +173,8 @@ M6 = {
     "local": {"world_model.local_embedding": 16},
     "action": {"world_model.action_in_tokens": True},
     "min_p": {"imagination.min_p": 0.2},
-    "context": {"imagination.context": 3, "world_model.sequence_length": 23, "world_model.sequences": 42},
+    "ages": {"world_model.ages": 15},
+    "muon": {"world_model.optimizer": "muon", "world_model.learning_rate": 0.003},
     "trust": {"imagination.trust": 0.7},
 }
 

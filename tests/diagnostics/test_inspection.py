@@ -21,6 +21,7 @@ from suite.evaluation import agent_for, model_template
 from suite.record import RunRecord, run_folder
 from suite.registry import Lazy
 from suite.reporting import QuietReporter
+from suite.world_model.ages import ages_of
 from tests.tiny import CORRIDOR, PENNIES, Corridor
 
 QUIET = QuietReporter()
@@ -182,7 +183,7 @@ def test_one_run_of_a_task_without_symbols(tmp_path):
 
 
 def test_a_model_that_knows_what_came_before(tmp_path):
-    """Its rollouts begin where those of the others do, and its odds are of a model that sees the frames before."""
+    """Its rollouts begin where those of the others do, and its odds are of a model that knows the frames before."""
     folders = [untrained(tmp_path, "unknown", agent) for agent in ("m5", "m6")]
     inspection.inspect(folders, tmp_path / "out", QUIET)
     steps = pd.read_csv(tmp_path / "out" / "steps.csv").set_index("run")
@@ -191,17 +192,16 @@ def test_a_model_that_knows_what_came_before(tmp_path):
 
     run = inspection.restore(RunRecord.open(folders[1], lock=False), QUIET)
     model, tokenizer = run.model["world_model"], run.model["tokenizer"]
-    real, context = evaluation_set.load("unknown", "smoke", QUIET), run.agent.config.imagination.context
-    found = rollouts.imagine(run.agent, model, tokenizer, real, jax.random.key(0), start=context)
+    real, past = evaluation_set.load("unknown", "smoke", QUIET), run.agent.past
+    found = rollouts.imagine(run.agent, model, tokenizer, real, jax.random.key(0), start=past)
     tokens_NTL = run.agent.tokenizer.encode(tokenizer, real.frames)
     whole = nnx.merge(run.agent.world_model_graph, model)
-    length = context + found.steps
-    hidden = whole(tokens_NTL[:, :length], real.action[:, :length])
-    np.testing.assert_allclose(
-        found.reward_odds, jax.nn.softmax(whole.reward_logits(hidden))[:, context:], rtol=1e-4, atol=1e-6
-    )
+    age_NTL = ages_of(tokens_NTL, run.agent.ages)
+    shown = slice(past, past + found.steps)
+    hidden = whole(tokens_NTL[:, shown], real.action[:, shown], age_BTL=age_NTL[:, shown])
+    np.testing.assert_allclose(found.reward_odds, jax.nn.softmax(whole.reward_logits(hidden)), rtol=1e-4, atol=1e-6)
     np.testing.assert_array_equal(
-        found.tokenized, run.agent.tokenizer.decode(tokenizer, tokens_NTL[:, context : length + 1])
+        found.tokenized, run.agent.tokenizer.decode(tokenizer, tokens_NTL[:, past : past + found.steps + 1])
     )
 
 

@@ -16,8 +16,9 @@ from suite.interface.batching import Batched
 from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
 from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
 from suite.world_model import training
+from suite.world_model.ages import ages_of
 from suite.world_model.heads import filled_odds
-from suite.world_model.imagination import Context, Dream, draw
+from suite.world_model.imagination import Dream, Past, draw
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import SPEC, small_config, small_model
 
@@ -202,10 +203,31 @@ def test_context_is_what_the_model_would_remember(learned):
     cache = learned.model.init_cache(3, 4)
     for t in range(3):
         cache, hidden = learned.model.step(cache, tokens[t], action[t])
-    context = Context(frames[:2], action[:2])
-    dream = Dream(learned.model, learned.tokenizer, learned.codes, Walk.spec, SPEC, 2, frames[2], context=context)
+    past = Past(frames[:2], action[:2])
+    dream = Dream(learned.model, learned.tokenizer, learned.codes, Walk.spec, SPEC, 2, frames[2], past=past, context=2)
     state, _ = dream.reset(jax.random.key(0))
     assert state.cache.keys.shape == cache.keys.shape
     after, same_hidden = learned.model.step(state.cache, state.tokens_BL, action[2])
     np.testing.assert_allclose(hidden, same_hidden, atol=1e-4)
     np.testing.assert_allclose(cache.keys, after.keys, atol=1e-4)
+
+
+@pytest.mark.parametrize("context", [0, 2])
+def test_dreams_know_how_old_tokens_are(learned, context):
+    """They go on as the model does that is told the ages in the whole sequence, real frames and dreamt ones."""
+    model = small_model(std=0.2, dropout=0.0, ages=3)
+    frames, action, _ = real_play(seed=6, steps=7, batch=3)
+    past = Past(frames[:4], action[:4])
+    dream = Dream(model, learned.tokenizer, learned.codes, Walk.spec, SPEC, 3, frames[4], past=past, context=context)
+    state, _ = dream.reset(jax.random.key(0))
+    shown = [*learned.tokenizer.encode(learned.codes, frames[:5])]
+    for t in (4, 5):
+        state, _ = dream.step(jax.random.key(t), state, action[t])
+        shown.append(state.tokens_BL)
+    _, hidden = model.step(state.cache, state.tokens_BL, action[6], state.age_BL)
+    tokens_BTL, action_BT = jnp.stack(shown, axis=1), action.swapaxes(0, 1)
+    age_BTL, read = ages_of(tokens_BTL, 3), slice(4 - context, 7)
+    whole = model(tokens_BTL[:, read], action_BT[:, read], age_BTL=age_BTL[:, read])
+    np.testing.assert_allclose(hidden, whole[:, -1], atol=1e-4)
+    untold = model(tokens_BTL[:, read], action_BT[:, read], age_BTL=0 * age_BTL[:, read])
+    assert abs(whole - untold).max() > 0.1
