@@ -14,6 +14,7 @@ LOCAL_EMBEDDING = 16  # numbers that the tokens around each one are embedded in
 AGES = 15  # longer than the timers of MinAtar's games
 MIN_P = 0.2
 MUON_LEARNING_RATE = 0.003
+AVERAGE = 0.99  # over a hundred gradient steps or so
 TRUST = 0.7  # where models knew more of the rewards, dreams helped or did nothing; where they knew less, they did harm
 
 # Each part of M6 by name: what it changes of M5.
@@ -25,6 +26,7 @@ PARTS: dict[str, Part] = {
     "min_p": lambda config: {"imagination.min_p": MIN_P},
     "ages": lambda config: {"world_model.ages": _ages(config)},
     "muon": lambda config: {"world_model.optimizer": "muon", "world_model.learning_rate": MUON_LEARNING_RATE},
+    "average": lambda config: {"world_model.average": AVERAGE},
     "trust": lambda config: {"imagination.trust": TRUST},
 }
 
@@ -32,9 +34,10 @@ PARTS: dict[str, Part] = {
 def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
-    Eight parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
+    Nine parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
     of the tokens around each one, the action added to every token, dreams without improbable tokens, the age of every
-    token, another optimizer of the model, and no dreams while the model does not foresee rewards.
+    token, another optimizer of the model, dreams with averaged parameters, and no dreams while the model does not
+    foresee rewards.
     """
     return _with_parts(config, PARTS)
 

@@ -128,7 +128,7 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
         )
     if config.dreams:
         one = jnp.ones((), jnp.int32)
-        arguments = (None if world_model is None else world_model.params, tokenizer, replay, keys[4], one)
+        arguments = (None if world_model is None else world_model.dreaming, tokenizer, replay, keys[4], one)
         measure("imagine", agent.imagine, learner, arguments, config.imagination.updates, policy_type)
     total = sum(row["ms"] for row in rows)
     for row in rows:

@@ -278,6 +278,7 @@ AGENTS = (
             ("min_p", "that dreams improbable tokens too"),
             ("ages", "that does not know how long anything has been where it is"),
             ("muon", "whose world model learns by Adam, as in m5"),
+            ("average", "that dreams with the newest parameters"),
             ("trust", "that dreams whatever its model knows of rewards"),
         )
     ),

@@ -154,6 +154,7 @@ class WorldModelConfig:
     # Muon (Jordan et al. 2024) for the matrices between hidden features, Adam for the rest; the paper has Adam alone.
     optimizer: Literal["adam", "muon"] = "adam"
     max_grad_norm: PositiveFloat = 0.5
+    average: Rate = 0.0  # decay, per gradient step, of the moving average of parameters that dreams use; 0: the newest
     compute_type: ComputeType = "auto"
 
 

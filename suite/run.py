@@ -156,7 +156,7 @@ class _Training:
                 metrics |= self._check("world_model", found)
         updates = config.imagined_updates(self.steps, metrics.get("world_model/reward_known"))
         if updates:
-            params = None if world_model is None else world_model.params
+            params = None if world_model is None else world_model.dreaming
             with self._phase("imagine"):
                 learner, found = agent.imagine(
                     learner, params, tokenizer, replay, keys[3], jnp.asarray(updates, jnp.int32)
@@ -241,15 +241,21 @@ def _split(state: TrainState) -> tuple[dict[str, Any], dict[str, Any]]:
     """A checkpoint's two items: what evaluation needs, and what only going on needs."""
     world_model = state.world_model
     resume = {"optimizer": state.learner.optimizer, "player": state.player, "replay": state.replay}
-    resume["world_model_optimizer"] = None if world_model is None else world_model.optimizer
-    return model_of(state.learner, state.tokenizer, None if world_model is None else world_model.params), resume
+    resume |= {"world_model_optimizer": None, "world_model_trained": None}
+    if world_model is not None:
+        resume["world_model_optimizer"] = world_model.optimizer
+        if world_model.averaged is not None:
+            resume["world_model_trained"] = world_model.params
+    return model_of(state.learner, state.tokenizer, None if world_model is None else world_model.dreaming), resume
 
 
 def _join(model: dict[str, Any], resume: dict[str, Any]) -> TrainState:
     """The inverse of `_split`."""
-    world_model = None
-    if model["world_model"] is not None:
-        world_model = WorldModelLearner(params=model["world_model"], optimizer=resume["world_model_optimizer"])
+    world_model, trained = None, resume["world_model_trained"]
+    if trained is not None:
+        world_model = WorldModelLearner(trained, resume["world_model_optimizer"], averaged=model["world_model"])
+    elif model["world_model"] is not None:
+        world_model = WorldModelLearner(model["world_model"], resume["world_model_optimizer"])
     learner = Learner(params=model["policy"], optimizer=resume["optimizer"], targets=model["targets"])
     return TrainState(learner, resume["player"], resume["replay"], model["tokenizer"], world_model)
 

@@ -52,8 +52,11 @@ class KillAt(StopAt):
                 raise Killed
 
 
+EVERYTHING = "world_model.optimizer=muon", "world_model.average=0.5"  # that a checkpoint of m5 may hold besides
+
+
 def config(agent: str = "m5", *overrides: str, seed: int = 0):
-    return registry.resolve("corridor", agent, "smoke", overrides, seed)
+    return registry.resolve("corridor", agent, "smoke", EVERYTHING + overrides, seed)
 
 
 def files(folder: Path) -> dict[str, bytes]:

@@ -154,8 +154,8 @@ class Agent:
         model_params = nnx.state(self._new_world_model(nnx.Rngs(model_key)))
         return fresh | {
             "tokenizer": self.tokenizer.init(tokenizer_key),
-            "world_model": world_model_training.WorldModelLearner(
-                params=model_params, optimizer=self.world_model_optimizer.init(model_params)
+            "world_model": world_model_training.WorldModelLearner.create(
+                self.config.world_model, self.world_model_optimizer, model_params
             ),
         }
 

@@ -65,10 +65,23 @@ class Sequences:
 
 @struct.dataclass
 class WorldModelLearner:
-    """What training changes: the parameters (an `nnx.State`) and the optimizer's state."""
+    """What training changes: the parameters (an `nnx.State`), the optimizer's state and perhaps a moving average."""
 
     params: Any
     optimizer: optax.OptState
+    averaged: Any = None
+
+    @classmethod
+    def create(
+        cls, config: WorldModelConfig, optimizer: optax.GradientTransformation, params: Any
+    ) -> WorldModelLearner:
+        """That of an untrained model."""
+        return cls(params, optimizer.init(params), jax.tree.map(jnp.copy, params) if config.average else None)
+
+    @property
+    def dreaming(self) -> Any:
+        """The parameters that dreams use."""
+        return self.params if self.averaged is None else self.averaged
 
 
 def make_optimizer(config: WorldModelConfig) -> optax.GradientTransformation:
@@ -220,7 +233,10 @@ def update(
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # Optax mixes both
         updates, state = optimizer.update(grads, learner.optimizer, learner.params)
     metrics |= {"loss": value, "gradient_norm": optax.tree.norm(grads)}
-    return WorldModelLearner(optax.apply_updates(learner.params, updates), state), metrics
+    params, averaged = optax.apply_updates(learner.params, updates), learner.averaged
+    if averaged is not None:
+        averaged = optax.incremental_update(params, averaged, 1 - config.average)
+    return WorldModelLearner(params, state, averaged), metrics
 
 
 def known_share(spec: TokenSpec, reward_loss: jax.Array, reward_N: jax.Array) -> jax.Array:

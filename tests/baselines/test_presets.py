@@ -92,6 +92,7 @@ MODEL_NOTES = {
     "world_model.action_in_tokens": False,
     "world_model.ages": 0,
     "world_model.optimizer": "adam",  # 23
+    "world_model.average": 0.0,
     "imagination.min_p": 0.0,
     "imagination.trust": 0.0,
     "imagination.world": "model",
@@ -175,6 +176,7 @@ M6 = {
     "min_p": {"imagination.min_p": 0.2},
     "ages": {"world_model.ages": 15},
     "muon": {"world_model.optimizer": "muon", "world_model.learning_rate": 0.003},
+    "average": {"world_model.average": 0.99},
     "trust": {"imagination.trust": 0.7},
 }
 

@@ -96,10 +96,10 @@ def test_cross_entropy_is_uniform_for_equal_logits():
 
 
 def test_an_update_is_clipped_adam_and_returns_the_named_metrics():
-    config = small_config(max_grad_norm=1e-3, dropout=0.0)
+    config = small_config(max_grad_norm=1e-3, dropout=0.0, average=0.75)
     graph, params = nnx.split(small_model(std=0.2, dropout=0.0))
     optimizer = make_optimizer(config)
-    learner = WorldModelLearner(params, optimizer.init(params))
+    learner = WorldModelLearner.create(config, optimizer, params)
     step = jax.jit(functools.partial(update, config, optimizer, graph, SPEC))
     after, metrics = step(learner, SEQUENCES, jax.random.key(0))
     assert set(metrics) == set(METRICS) and len(METRICS) == len(set(METRICS))
@@ -119,6 +119,14 @@ def test_an_update_is_clipped_adam_and_returns_the_named_metrics():
         params,
         gradient,
     )
+    mean = jax.tree.map(lambda old, new: 0.75 * old + 0.25 * new, params, after.params)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-7), after.dreaming, mean)
+
+
+def test_without_an_average_dreams_use_the_newest_parameters():
+    _, params = nnx.split(small_model())
+    learner = WorldModelLearner.create(small_config(), make_optimizer(small_config()), params)
+    assert learner.averaged is None and learner.dreaming is learner.params
 
 
 def test_dropout_follows_the_key():
