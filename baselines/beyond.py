@@ -11,8 +11,9 @@ from suite.overrides import apply_changes
 Part = Callable[[Config], dict[str, Any]]
 
 LOCAL_EMBEDDING = 16  # numbers that the tokens around each one are embedded in
-AGES = 15  # longer than the timers of MinAtar's games
 MIN_P = 0.2
+TWO_PLAYERS = ("openspiel/", "pettingzoo/")
+AGES = 15  # longer than the timers of MinAtar's games
 MUON_LEARNING_RATE = 0.003
 AVERAGE = 0.99  # over a hundred gradient steps or so
 TRUST = 0.7  # where models knew more of the rewards, dreams helped or did nothing; where they knew less, they did harm
@@ -23,7 +24,8 @@ PARTS: dict[str, Part] = {
     "grid": lambda config: {"world_model.positions": "grid"},
     "local": lambda config: {"world_model.local_embedding": LOCAL_EMBEDDING},
     "action": lambda config: {"world_model.action_in_tokens": True},
-    "min_p": lambda config: {"imagination.min_p": MIN_P},
+    "min_p": lambda config: {"imagination.min_p": MIN_P} if config.task.startswith(TWO_PLAYERS) else {},
+    "places": lambda config: {"world_model.place_heads": True},
     "ages": lambda config: {"world_model.ages": _ages(config)},
     "muon": lambda config: {"world_model.optimizer": "muon", "world_model.learning_rate": MUON_LEARNING_RATE},
     "average": lambda config: {"world_model.average": AVERAGE},
@@ -34,10 +36,10 @@ PARTS: dict[str, Part] = {
 def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
-    Nine parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
-    of the tokens around each one, the action added to every token, dreams without improbable tokens, the age of every
-    token, another optimizer of the model, dreams with averaged parameters, and no dreams while the model does not
-    foresee rewards.
+    Ten parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
+    of the tokens around each one, the action added to every token, rewards and ends that are read off every token, the
+    age of every token, another optimizer of the model, dreams with averaged parameters and, in games of two players,
+    without improbable tokens, and no dreams while the model does not foresee rewards.
     """
     return _with_parts(config, PARTS)
 

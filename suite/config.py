@@ -131,12 +131,14 @@ class WorldModelConfig:
     dropout: Rate = 0.1  # embedding, attention and residual
     initial_std: PositiveFloat = 0.02  # of every kernel and embedding, GPT-2's; narrow models learn faster from more
     positions: Literal["flat", "grid"] = "flat"  # RoPE over the token index, or over (time, row, column): note 20
-    # This and the next four are not the paper's (docs/agents.md): copy tokens from near their place, or make them new.
+    # This and the next five are not the paper's (docs/agents.md): copy tokens from near their place, or make them new.
     correspondence: bool = False
     correspondence_radius: NotNegative = 1  # of the square that is copied from; symbols: their own place alone
     # Numbers in a further embedding of the 3x3 tokens around each, of which its own embedding gets a sum; 0: none.
     local_embedding: NotNegative = 0
     action_in_tokens: bool = False  # an embedding of the action is added to every token of its block
+    # Reward and termination are read off every token of a frame too, and not off the action's alone. Patches only.
+    place_heads: bool = False
     # The model is told every token's age, for how many steps its place has shown it, up to so many. 0: it is not told.
     # Only where tokens are patches: symbols of games that people play have no timers.
     ages: NotNegative = 0

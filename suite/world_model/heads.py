@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 from flax import nnx, struct
@@ -28,6 +30,18 @@ class Head(nnx.Module):
         features = nnx.relu(self.hidden(hidden))
         logits = jnp.dot(features, self.kernel[...].astype(self.dtype), preferred_element_type=jnp.float32)
         return logits + self.bias[...].reshape((1,) * (logits.ndim - 1) + (-1,))
+
+
+class PlaceHead(Head):
+    """Logits [..., classes] of what happens at any of L places: the logarithm of the mean of exp of those at each.
+
+    One network for all places: what it learns of a rare event at one of them it knows at all. Not the paper's.
+    """
+
+    def __call__(self, hidden: jax.Array) -> jax.Array:
+        """From hidden states [..., L, D]."""
+        logits = super().__call__(hidden)
+        return jax.nn.logsumexp(logits, axis=-2) - math.log(logits.shape[-2])
 
 
 def filled_odds(logits: jax.Array, valid_K: jax.Array) -> jax.Array:

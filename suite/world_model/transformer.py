@@ -24,7 +24,7 @@ from suite.interface.tokens import TokenSpec
 from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
 from suite.world_model.dropout import dropout
-from suite.world_model.heads import Head, TurnHead, TurnLogits, filled_odds
+from suite.world_model.heads import Head, PlaceHead, TurnHead, TurnLogits, filled_odds
 
 TERMINATION_CLASSES = 2
 
@@ -129,6 +129,9 @@ class WorldModel(nnx.Module):
         self.token_action_embedding = (
             nnx.Embed(tokens.num_actions, width, embedding_init=init, rngs=rngs) if config.action_in_tokens else None
         )
+        places = config.place_heads and tokens.spatial
+        self.reward_places = PlaceHead(config, len(tokens.reward_classes), self.dtype, rngs) if places else None
+        self.termination_places = PlaceHead(config, TERMINATION_CLASSES, self.dtype, rngs) if places else None
         self.ages = config.ages if tokens.spatial else 0
         self.age_embedding = nnx.Embed(self.ages + 1, width, embedding_init=init, rngs=rngs) if self.ages else None
 
@@ -196,6 +199,8 @@ class WorldModel(nnx.Module):
         In a game, of the reward of player `seat` (int32 [B, T]): the stream itself does not say which of them is ours.
         """
         logits = self.reward_head(hidden[..., -1, :])
+        if self.reward_places is not None:
+            logits = logits + self.reward_places(hidden[..., :-1, :])
         if seat is None:
             return logits
         first, second = jnp.split(logits, self.seats, axis=-1)
@@ -203,7 +208,10 @@ class WorldModel(nnx.Module):
 
     def termination_logits(self, hidden: jax.Array) -> jax.Array:
         """float32 [B, T, 2]: (goes on, terminated), from hidden states [B, T, S, D] (or without the T axis)."""
-        return self.termination_head(hidden[..., -1, :])
+        logits = self.termination_head(hidden[..., -1, :])
+        if self.termination_places is not None:
+            logits = logits + self.termination_places(hidden[..., :-1, :])
+        return logits
 
     def turn_logits(self, hidden: jax.Array) -> TurnLogits:
         """Of a game's next turn, from hidden states [B, T, S, D] (or without the T axis)."""

@@ -90,6 +90,7 @@ MODEL_NOTES = {
     "world_model.correspondence_radius": 1,
     "world_model.local_embedding": 0,
     "world_model.action_in_tokens": False,
+    "world_model.place_heads": False,
     "world_model.ages": 0,
     "world_model.optimizer": "adam",  # 23
     "world_model.average": 0.0,
@@ -173,7 +174,8 @@ M6 = {
     "grid": {"world_model.positions": "grid"},
     "local": {"world_model.local_embedding": 16},
     "action": {"world_model.action_in_tokens": True},
-    "min_p": {"imagination.min_p": 0.2},
+    "min_p": {},  # of games of two players alone
+    "places": {"world_model.place_heads": True},
     "ages": {"world_model.ages": 15},
     "muon": {"world_model.optimizer": "muon", "world_model.learning_rate": 0.003},
     "average": {"world_model.average": 0.99},
@@ -219,6 +221,12 @@ def test_an_agent_differs_in_what_defines_it_and_in_nothing_else(base, agent, ch
     found, reference = settings(agent), settings(base)
     different = {name: value for name, value in found.items() if value != reference[name]}
     assert different == {"agent": agent, **changes}
+
+
+@pytest.mark.parametrize(("task", "least"), [("openspiel/tic_tac_toe", 0.2), ("minatar/breakout", 0.0)])
+def test_m6_dreams_what_is_improbable_but_in_games_of_two_players(task, least):
+    assert registry.resolve(task, "m6", "small").imagination.min_p == least
+    assert registry.resolve(task, "m6_no_min_p", "small").imagination.min_p == 0
 
 
 def test_every_agent_is_held_against_the_paper():

@@ -10,6 +10,7 @@ import optax
 import pytest
 from flax import nnx
 
+from suite.world_model.heads import Head
 from suite.world_model.imagination import next_frame
 from suite.world_model.training import METRICS, WorldModelLearner, cross_entropy, losses, make_optimizer, update
 from suite.world_model.transformer import WorldModel
@@ -127,6 +128,25 @@ def test_without_an_average_dreams_use_the_newest_parameters():
     _, params = nnx.split(small_model())
     learner = WorldModelLearner.create(small_config(), make_optimizer(small_config()), params)
     assert learner.averaged is None and learner.dreaming is learner.params
+
+
+def test_rewards_and_ends_are_read_off_every_place():
+    """Beside what the action's token says: log-mean-exp over the frame's tokens, of one network for all of them."""
+    changes = {"place_heads": True, "dropout": 0.0}
+    model = small_model(std=0.2, **changes)
+    hidden = model(SEQUENCES.tokens_BTL[:, :-1], SEQUENCES.action_BT)
+    pairs = (
+        (model.reward_logits, model.reward_head, model.reward_places),
+        (model.termination_logits, model.termination_head, model.termination_places),
+    )
+    for logits, head, places in pairs:
+        each = np.stack([Head.__call__(places, hidden[..., place, :]) for place in range(model.block - 1)], axis=-2)
+        expected = head(hidden[..., -1, :]) + np.log(np.exp(np.asarray(each, np.float64)).mean(-2))
+        np.testing.assert_allclose(logits(hidden), expected, rtol=1e-4, atol=1e-5)
+        moved = hidden[..., np.array([2, 0, 1, 5, 4, 3, 6]), :]
+        np.testing.assert_allclose(logits(moved), logits(hidden), rtol=1e-5, atol=1e-6)  # wherever it happens
+    symbols = WorldModel(small_config(**changes), dataclasses.replace(SPEC, spatial=False), GRID, nnx.Rngs(0))
+    assert symbols.reward_places is None and symbols.termination_places is None
 
 
 def test_dropout_follows_the_key():
