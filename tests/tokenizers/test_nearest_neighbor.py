@@ -142,7 +142,8 @@ def test_chunks_do_not_change_the_codes(monkeypatch):
     tokenizer, frames = tokenizer_of(size=32), random_frames(0, 15)
     state, _ = tokenizer.update(tokenizer.init(jax.random.key(0)), frames)
     whole = tokenizer.encode(state, frames)
-    monkeypatch.setattr("suite.tokenizers.nearest_neighbor.CHUNK_DISTANCES", 32 * 7)  # 13 chunks, the last one padded
+    for limit in ("CHUNK_DISTANCES", "CPU_CHUNK_DISTANCES"):
+        monkeypatch.setattr(f"suite.tokenizers.nearest_neighbor.{limit}", 32 * 7)  # 13 chunks, the last one padded
     np.testing.assert_array_equal(tokenizer.encode(state, frames), whole)
 
 
