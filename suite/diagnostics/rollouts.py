@@ -173,8 +173,9 @@ def compare(
       tokens, which percentage of the next frame they copy. Accuracies of
       symbols are in percent, of the same, and of the extractor on the real frame (the most that a rollout can have).
       Percents of rewards and terminations that are right; and, for events, that is rewards other than 0 and
-      terminations, how often they come, and how likely they are by the model on the real frames. The summary has means
-      over all steps, precision and recall of the rollouts' events, and the calibration error of their probabilities.
+      terminations, how often they come, how likely they are by the model on the real frames, and precision and recall
+      of the rollouts'. The summary has means over all steps, precision and recall of all steps' events together, and
+      the calibration error of their probabilities.
     """
     steps = found.steps
     counted, shown = real.counted[:, :steps], real.frame_counted[:, :steps]
@@ -205,19 +206,23 @@ def compare(
         "termination": (found.terminated.astype(int), ended.astype(int), 0, found.termination_odds),
     }
     summary: dict[str, float] = {}
+    shares: dict[str, list[float]] = {}
     for name, (imagined, true, nothing, odds) in events.items():
         columns |= {
             f"{name}_percent": (100.0 * (imagined == true), counted),
             f"{name}_frequency": (100.0 * (true != nothing), counted),
             f"{name}_probability": (100.0 * odds, counted),
         }
+        at_step = [precision_recall(x[c], y[c], nothing) for x, y, c in zip(imagined.T, true.T, counted.T, strict=True)]
+        for measure, values in zip(("precision", "recall"), zip(*at_step, strict=True), strict=True):
+            shares[f"{name}_{measure}_percent"] = [100 * value for value in values]
         precision, recall = precision_recall(imagined[counted], true[counted], nothing)
         summary |= {
             f"{name}_precision_percent": 100 * precision,
             f"{name}_recall_percent": 100 * recall,
             f"{name}_calibration_error": 100 * calibration_error(odds[counted], true[counted] != nothing),
         }
-    per_step = {name: mean_per_step(*column) for name, column in columns.items()}
+    per_step = {name: mean_per_step(*column) for name, column in columns.items()} | shares
     rows = [{"step": t + 1, **{name: float(values[t]) for name, values in per_step.items()}} for t in range(steps)]
     overall = {name: _mean(*column) for name, column in columns.items()}
     all_frames = np.pad(shown, ((0, 0), (1, 0)), constant_values=True)

@@ -77,6 +77,8 @@ def test_the_environment_itself(real, perfect):
     for event in ("reward", "termination"):
         assert summary[f"{event}_precision_percent"] == summary[f"{event}_recall_percent"] == 100
         assert summary[f"{event}_calibration_error"] == 0
+    assert [row["reward_recall_percent"] for row in rows[:2]] == [row["reward_precision_percent"] for row in rows[:2]]
+    assert rows[0]["reward_recall_percent"] == 100
     assert summary["codes_used"] == 4 and summary["steps"] == 3 and summary["trajectories"] == 3
     assert [row["step"] for row in rows] == [1, 2, 3]
 
@@ -104,6 +106,7 @@ def test_a_constant(real, perfect):
     assert [row["repeated_symbols_percent"] for row in rows] == pytest.approx([100 * 4 / 6, 50, 50])
     # Steps that count: 3, 3 and, after the end, 2.
     assert [row["reward_percent"] for row in rows] == pytest.approx([100 * 2 / 3, 100 * 2 / 3, 100])
+    assert [row["reward_recall_percent"] for row in rows] == pytest.approx([0, 0, math.nan], nan_ok=True)
     assert [row["termination_percent"] for row in rows] == pytest.approx([100, 100 * 2 / 3, 100])
     assert [row["termination_frequency"] for row in rows] == pytest.approx([0, 100 / 3, 0])
     assert summary["error"] == pytest.approx(12 / 7)
