@@ -13,6 +13,9 @@ Part = Callable[[Config], dict[str, Any]]
 LOCAL_EMBEDDING = 16  # numbers that the tokens around each one are embedded in
 MIN_P = 0.2
 TWO_PLAYERS = ("openspiel/", "pettingzoo/")
+# At the paper's 0.75, grass and water at night are one code: distances shrink with the light. A codebook of twice the
+# size holds what 0.5 tells apart.
+NIGHT_THRESHOLD = 0.5
 AGES = 15  # longer than the timers of MinAtar's games
 MUON_LEARNING_RATE = 0.003
 AVERAGE = 0.99  # over a hundred gradient steps or so
@@ -29,6 +32,7 @@ PARTS: dict[str, Part] = {
     "ages": lambda config: {"world_model.ages": _ages(config)},
     "muon": lambda config: {"world_model.optimizer": "muon", "world_model.learning_rate": MUON_LEARNING_RATE},
     "average": lambda config: {"world_model.average": AVERAGE},
+    "codes": lambda config: _finer_codes(config) if config.task.startswith("craftax") else {},
     "trust": lambda config: {"imagination.trust": TRUST},
 }
 
@@ -36,10 +40,11 @@ PARTS: dict[str, Part] = {
 def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
-    Ten parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an embedding
-    of the tokens around each one, the action added to every token, rewards and ends that are read off every token, the
-    age of every token, another optimizer of the model, dreams with averaged parameters and, in games of two players,
-    without improbable tokens, and no dreams while the model does not foresee rewards.
+    Eleven parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an
+    embedding of the tokens around each one, the action added to every token, rewards and ends that are read off every
+    token, the age of every token, another optimizer of the model, dreams with averaged parameters and, in games of two
+    players, without improbable tokens, on Craftax a finer codebook, and no dreams while the model does not foresee
+    rewards.
     """
     return _with_parts(config, PARTS)
 
@@ -60,6 +65,10 @@ def oracle(config: Config) -> Config:
 def _ages(config: Config) -> int:
     """`AGES`, or what the first iteration's steps leave room for before a training sequence."""
     return min(AGES, config.environment.rollout_length - config.world_model.sequence_length - 1)
+
+
+def _finer_codes(config: Config) -> dict[str, Any]:
+    return {"tokenizer.threshold": NIGHT_THRESHOLD, "tokenizer.codebook_size": 2 * config.tokenizer.codebook_size}
 
 
 def _with_parts(config: Config, parts: Mapping[str, Part]) -> Config:

@@ -43,7 +43,7 @@ CRAFTAX_CLASSIC_SMALL: dict[str, Any] = {
     # Many steps on few sequences each: a fifth less loss than a quarter of the steps on four times as many.
     "world_model.sequences": 4,
     "world_model.minibatches": 2,
-    "world_model.updates": 150,
+    "world_model.updates": 300,
     "world_model.dropout": 0.0,
     "imagination.start_step": 10_000,
     "imagination.horizon": 5,
@@ -229,11 +229,11 @@ MINATAR_SMALL: dict[str, Any] = {
     "world_model.sequence_length": 6,
     "world_model.sequences": 8,
     "world_model.minibatches": 1,
-    "world_model.updates": 60,
+    "world_model.updates": 80,
     "imagination.start_step": 10_000,
     "imagination.horizon": 6,
     "imagination.num_envs": 48,
-    "imagination.updates": 8,
+    "imagination.updates": 16,
     # The paper's 0.05 outweighs what rewards teach in a tenth of its steps.
     "imagination.entropy_coefficient": 0.01,
     "evaluation.every_steps": 20_000,

@@ -280,6 +280,7 @@ AGENTS = (
             ("ages", "that does not know how long anything has been where it is"),
             ("muon", "whose world model learns by Adam, as in m5"),
             ("average", "that dreams with the newest parameters"),
+            ("codes", "with the codebook of m5 on Craftax"),
             ("trust", "that dreams whatever its model knows of rewards"),
         )
     ),

@@ -179,6 +179,7 @@ M6 = {
     "ages": {"world_model.ages": 15},
     "muon": {"world_model.optimizer": "muon", "world_model.learning_rate": 0.003},
     "average": {"world_model.average": 0.99},
+    "codes": {"tokenizer.threshold": 0.5, "tokenizer.codebook_size": 8192},
     "trust": {"imagination.trust": 0.7},
 }
 
@@ -227,6 +228,14 @@ def test_an_agent_differs_in_what_defines_it_and_in_nothing_else(base, agent, ch
 def test_m6_dreams_what_is_improbable_but_in_games_of_two_players(task, least):
     assert registry.resolve(task, "m6", "small").imagination.min_p == least
     assert registry.resolve(task, "m6_no_min_p", "small").imagination.min_p == 0
+
+
+@pytest.mark.parametrize(("task", "threshold", "size"), [("craftax_full", 0.5, 1024), ("minatar/breakout", 0.75, 512)])
+def test_m6_has_a_finer_codebook_on_craftax_alone(task, threshold, size):
+    tokenizer = registry.resolve(task, "m6", "small").tokenizer
+    assert (tokenizer.threshold, tokenizer.codebook_size) == (threshold, size)
+    coarse = registry.resolve(task, "m6_no_codes", "small").tokenizer
+    assert (coarse.threshold, coarse.codebook_size) == (0.75, 512)
 
 
 def test_every_agent_is_held_against_the_paper():
