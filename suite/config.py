@@ -177,6 +177,9 @@ class ImaginationConfig:
     # (`world_model/reward_known`): a policy that learns from rewards that do not come is worse than one that does not
     # dream. 0: always.
     trust: Rate = 0.0
+    # The share is measured on each iteration's new steps, before the model learns from them, as a moving average over
+    # so many iterations. 0: on the replayed steps that the model learns from, whose rare rewards it may know by heart.
+    trust_window: NotNegative = 0
     start_step: NotNegative = 200_000  # T_BP: warmup
     horizon: Positive = 20  # T_WM
     num_envs: Positive = 48
@@ -300,6 +303,8 @@ def _problems(config: Config) -> Iterator[str]:
         yield f"environment.rollout_length={env.rollout_length} must be at least environment.burn_in={env.burn_in}"
     if dream.world == "game" and model.enabled:
         yield "imagination.world=game has no use for a world model: world_model.enabled=false"
+    if dream.trust_window and not dream.trust:
+        yield f"imagination.trust_window={dream.trust_window} measures what imagination.trust=0 does not ask for"
     if dream.world == "game" and dream.trust:
         yield "imagination.world=game needs no trust, for its rewards are the true ones: imagination.trust=0"
     if dream.world == "model" and dream.horizon + dream.context > model.sequence_length:

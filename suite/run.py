@@ -241,9 +241,10 @@ def _split(state: TrainState) -> tuple[dict[str, Any], dict[str, Any]]:
     """A checkpoint's two items: what evaluation needs, and what only going on needs."""
     world_model = state.world_model
     resume = {"optimizer": state.learner.optimizer, "player": state.player, "replay": state.replay}
-    resume |= {"world_model_optimizer": None, "world_model_trained": None}
+    resume |= {"world_model_optimizer": None, "world_model_trained": None, "world_model_measured": None}
     if world_model is not None:
         resume["world_model_optimizer"] = world_model.optimizer
+        resume["world_model_measured"] = world_model.measured
         if world_model.averaged is not None:
             resume["world_model_trained"] = world_model.params
     return model_of(state.learner, state.tokenizer, None if world_model is None else world_model.dreaming), resume
@@ -252,10 +253,13 @@ def _split(state: TrainState) -> tuple[dict[str, Any], dict[str, Any]]:
 def _join(model: dict[str, Any], resume: dict[str, Any]) -> TrainState:
     """The inverse of `_split`."""
     world_model, trained = None, resume["world_model_trained"]
-    if trained is not None:
-        world_model = WorldModelLearner(trained, resume["world_model_optimizer"], averaged=model["world_model"])
-    elif model["world_model"] is not None:
-        world_model = WorldModelLearner(model["world_model"], resume["world_model_optimizer"])
+    if model["world_model"] is not None:
+        world_model = WorldModelLearner(
+            params=model["world_model"] if trained is None else trained,
+            optimizer=resume["world_model_optimizer"],
+            averaged=None if trained is None else model["world_model"],
+            measured=resume["world_model_measured"],
+        )
     learner = Learner(params=model["policy"], optimizer=resume["optimizer"], targets=model["targets"])
     return TrainState(learner, resume["player"], resume["replay"], model["tokenizer"], world_model)
 

@@ -43,3 +43,11 @@ def suite(capsys):
         return code, *capsys.readouterr()
 
     return command
+
+
+@pytest.fixture(scope="module")
+def hasty_compilation():
+    """For programs that run for a moment: the whole module's are compiled without most optimisations."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import Any
 
 import jax
@@ -152,12 +153,12 @@ class Agent:
         if not self.config.world_model.enabled:
             return fresh
         model_params = nnx.state(self._new_world_model(nnx.Rngs(model_key)))
-        return fresh | {
-            "tokenizer": self.tokenizer.init(tokenizer_key),
-            "world_model": world_model_training.WorldModelLearner.create(
-                self.config.world_model, self.world_model_optimizer, model_params
-            ),
-        }
+        learner = world_model_training.WorldModelLearner.create(
+            self.config.world_model, self.world_model_optimizer, model_params
+        )
+        if self.config.imagination.trust_window:
+            learner = dataclasses.replace(learner, measured=jnp.zeros(1 + len(self.tokens.reward_classes)))
+        return fresh | {"tokenizer": self.tokenizer.init(tokenizer_key), "world_model": learner}
 
     def new_replay(self) -> ReplayState:
         """An empty replay buffer, with room for the environments' states if dreams happen in the game."""
@@ -233,25 +234,15 @@ class Agent:
         key: jax.Array,
     ) -> tuple[world_model_training.WorldModelLearner, Metrics]:
         """Step 3, second half (Algorithm 5): the transformer learns from replayed sequences of T_WM + 1 frames."""
-        config = self.config.world_model
+        config, plan = self.config.world_model, self.config.imagination
+        if learner.measured is not None:
+            new = self._measure(learner.dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
+            measured = learner.measured + (new - learner.measured) / plan.trust_window
+            learner = dataclasses.replace(learner, measured=measured)
 
         def update(learner, key):
             sample_key, dropout_key = jax.random.split(key)
-            length = self.ages + config.sequence_length + 1
-            batch = self.replay.sample(replay, sample_key, config.sequences // config.minibatches, length)
-            tokens_BTL = encode_frame(self.tokenizer, tokenizer, batch.observation, batch.turn)
-            age_BTL = ages_of(tokens_BTL, self.ages) if self.ages else None
-            batch, tokens_BTL, age_BTL = jax.tree.map(lambda x: x[:, self.ages :], (batch, tokens_BTL, age_BTL))
-            action_BT = batch.action if batch.turn is None else stream_action(batch.turn, batch.action)
-            sequences = world_model_training.Sequences(
-                tokens_BTL=tokens_BTL,
-                action_BT=action_BT[:, :-1],
-                reward_BT=batch.reward[:, :-1],
-                terminated_BT=batch.terminated[:, :-1],
-                ended_BT=batch.first[:, 1:],
-                turn_BT=batch.turn,
-                age_BTL=None if age_BTL is None else age_BTL[:, :-1],
-            )
+            sequences = self._replayed(tokenizer, replay, sample_key)
             learner, metrics = world_model_training.update(
                 config,
                 self.world_model_optimizer,
@@ -261,14 +252,59 @@ class Agent:
                 sequences,
                 dropout_key,
             )
-            return learner, (metrics, sequences.reward_BT if self.config.imagination.trust else None)
+            return learner, (metrics, sequences.reward_BT if plan.trust else None)
 
         keys = jax.random.split(key, config.updates * config.minibatches)
         learner, (metrics, reward_NBT) = jax.lax.scan(update, learner, keys)
         metrics = jax.tree.map(jnp.mean, metrics)
-        if reward_NBT is not None:
-            metrics["reward_known"] = world_model_training.known_share(self.tokens, metrics["reward_loss"], reward_NBT)
+        if plan.trust:
+            loss = metrics["reward_loss"]
+            frequency_R = world_model_training.reward_frequency(self.tokens, reward_NBT)
+            if learner.measured is not None:
+                # Averages that began with zeros are all too small by the same factor, which is what frequencies lack.
+                loss, frequency_R = learner.measured[0], learner.measured[1:]
+                loss, frequency_R = loss / frequency_R.sum(), frequency_R / frequency_R.sum()
+            metrics["reward_known"] = world_model_training.known_share(loss, frequency_R)
         return learner, metrics
+
+    def _replayed(
+        self, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array, recent: int = 0
+    ) -> world_model_training.Sequences:
+        """A minibatch of replayed sequences of T_WM + 1 frames; with `recent`, of those that ended so lately."""
+        config = self.config.world_model
+        length = self.ages + config.sequence_length + 1
+        batch = self.replay.sample(replay, key, config.sequences // config.minibatches, length, recent)
+        tokens_BTL = encode_frame(self.tokenizer, tokenizer, batch.observation, batch.turn)
+        age_BTL = ages_of(tokens_BTL, self.ages) if self.ages else None
+        batch, tokens_BTL, age_BTL = jax.tree.map(lambda x: x[:, self.ages :], (batch, tokens_BTL, age_BTL))
+        action_BT = batch.action if batch.turn is None else stream_action(batch.turn, batch.action)
+        return world_model_training.Sequences(
+            tokens_BTL=tokens_BTL,
+            action_BT=action_BT[:, :-1],
+            reward_BT=batch.reward[:, :-1],
+            terminated_BT=batch.terminated[:, :-1],
+            ended_BT=batch.first[:, 1:],
+            turn_BT=batch.turn,
+            age_BTL=None if age_BTL is None else age_BTL[:, :-1],
+        )
+
+    def _measure(self, params: Any, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array) -> jax.Array:
+        """Float32 [1 + R]: a model's loss of rewards on the newest iteration's steps, and each class's frequency.
+
+        Sequences are drawn among those that the newest iteration holds whole, and are as many as cover it once.
+        """
+        model, config = nnx.merge(self.world_model_graph, params), self.config.world_model
+        newest = self.config.environment.rollout_length - config.sequence_length
+
+        def measure(key):
+            new = self._replayed(tokenizer, replay, key, newest)
+            _, metrics = world_model_training.losses(model, new, config, self.tokens)
+            frequency_R = world_model_training.reward_frequency(self.tokens, new.reward_BT)
+            return jnp.concatenate([metrics["reward_loss"][None], frequency_R])
+
+        steps = config.sequences // config.minibatches * config.sequence_length
+        keys = jax.random.split(key, math.ceil(self.config.steps_per_iteration / steps))
+        return jax.lax.map(measure, keys).mean(0)
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def imagine(

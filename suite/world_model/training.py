@@ -65,11 +65,16 @@ class Sequences:
 
 @struct.dataclass
 class WorldModelLearner:
-    """What training changes: the parameters (an `nnx.State`), the optimizer's state and perhaps a moving average."""
+    """What training changes: the parameters (an `nnx.State`), the optimizer's state and perhaps moving averages.
+
+    Those are of the parameters and, float32 [1 + R], of the loss of rewards on steps that the model had not learned
+    from and of how often each of the R classes of reward came in them; this one begins with zeros.
+    """
 
     params: Any
     optimizer: optax.OptState
     averaged: Any = None
+    measured: jax.Array | None = None
 
     @classmethod
     def create(
@@ -236,21 +241,23 @@ def update(
     params, averaged = optax.apply_updates(learner.params, updates), learner.averaged
     if averaged is not None:
         averaged = optax.incremental_update(params, averaged, 1 - config.average)
-    return WorldModelLearner(params, state, averaged), metrics
+    return learner.replace(params=params, optimizer=state, averaged=averaged), metrics  # type: ignore[attr-defined]
 
 
-def known_share(spec: TokenSpec, reward_loss: jax.Array, reward_N: jax.Array) -> jax.Array:
+def reward_frequency(spec: TokenSpec, reward_N: jax.Array) -> jax.Array:
+    """Float32 [R]: how often each class of reward comes among rewards, float32 of any shape."""
+    return jax.nn.one_hot(spec.reward_to_class(reward_N.reshape(-1)), len(spec.reward_classes)).mean(0)
+
+
+def known_share(reward_loss: jax.Array, frequency_R: jax.Array) -> jax.Array:
     """The share of what rewards hold that a model knows: 1 - its loss / the entropy of how often each reward comes.
 
     1: it foresees every reward; 0: it knows no more than how often each comes; below 0: less than that.
 
     Args:
-      spec: the token stream, for the classes of rewards.
-      reward_loss: nats a step, its mean over the steps of `reward_N`.
-      reward_N: float32 of any shape; the rewards that it was asked for. If all are alike there is nothing to know: 0.
+      reward_loss: nats a step, a mean over steps.
+      frequency_R: how often each class of reward came in them. If all are alike there is nothing to know: 0.
     """
-    class_N = spec.reward_to_class(reward_N.reshape(-1))
-    frequency_R = jax.nn.one_hot(class_N, len(spec.reward_classes)).mean(0)
     entropy = jax.scipy.special.entr(frequency_R).sum()
     return jnp.where(entropy > 0, 1 - reward_loss / jnp.where(entropy > 0, entropy, 1.0), 0.0)
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from suite import registry
+from suite.agent.dyna import Agent
 from suite.errors import UserError
 from suite.interface.tokens import TokenSpec
-from suite.world_model.training import known_share
+from suite.world_model.training import known_share, reward_frequency
+from tests.tiny import WIDE_CORRIDOR, WideCorridor
 
 SPEC = TokenSpec(tokens_per_frame=1, num_codes=2, num_actions=2, reward_classes=(-1.0, 0.0, 1.0))
 REWARDS = jnp.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
@@ -17,11 +23,11 @@ ENTROPY = 4 / 6 * jnp.log(6 / 4) + 2 * (1 / 6 * jnp.log(6.0))
 
 @pytest.mark.parametrize(("loss", "known"), [(0.0, 1.0), (ENTROPY, 0.0), (ENTROPY / 4, 0.75), (2 * ENTROPY, -1.0)])
 def test_what_is_known_of_rewards(loss, known):
-    assert known_share(SPEC, jnp.asarray(loss), REWARDS) == pytest.approx(known, abs=1e-6)
+    assert known_share(jnp.asarray(loss), reward_frequency(SPEC, REWARDS)) == pytest.approx(known, abs=1e-6)
 
 
 def test_of_rewards_that_are_all_alike_nothing_is_known():
-    assert known_share(SPEC, jnp.asarray(0.3), 0 * REWARDS) == 0
+    assert known_share(jnp.asarray(0.3), reward_frequency(SPEC, 0 * REWARDS)) == 0
 
 
 def test_no_dreams_below_the_threshold():
@@ -35,3 +41,31 @@ def test_no_dreams_below_the_threshold():
 def test_the_true_game_needs_no_trust():
     with pytest.raises(UserError, match="its rewards are the true ones"):
         registry.resolve("minatar/breakout", "oracle", "small", ["imagination.trust=0.5"])
+
+
+def test_the_window_needs_trust():
+    with pytest.raises(UserError, match=r"trust_window=10 measures what imagination\.trust=0 does not ask for"):
+        registry.resolve("minatar/breakout", "m5", "small", ["imagination.trust_window=10"])
+
+
+def test_the_newest_steps_measure_a_model_that_has_not_learned_from_them(monkeypatch, hasty_compilation):
+    """The buffer holds two iterations: no step of the first one pays, every step of the second one does."""
+    monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
+    config = registry.resolve("wide_corridor", "m5", "smoke", ["imagination.trust=0.7", "imagination.trust_window=2"])
+    agent = Agent(config, WideCorridor())
+    state = agent.init(jax.random.key(0))
+    _, trajectory, _ = agent.collect(state.learner.acting, state.player, jax.random.key(1))
+    replay = state.replay
+    for reward in (0, 1):
+        paid = dataclasses.replace(trajectory, reward_TB=jnp.full_like(trajectory.reward_TB, reward))
+        replay = agent.remember(replay, paid)
+    learner, expected = state.world_model, jnp.zeros(3)
+    measure = jax.jit(agent._measure)
+    for key in jax.random.split(jax.random.key(2), 2):
+        now = measure(learner.dreaming, state.tokenizer, replay, jax.random.fold_in(key, 0))
+        np.testing.assert_array_equal(now[1:], [0, 1])
+        expected = expected + (now - expected) / 2
+        learner, metrics = agent.update_world_model(learner, state.tokenizer, replay, key)
+        np.testing.assert_allclose(learner.measured, expected, rtol=1e-5)
+        assert metrics["reward_known"] == 0  # for all rewards that were measured are alike
+    assert metrics["reward_loss"] < now[0]  # half of the steps that it learned from pay, and it had begun to say so

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import pandas as pd
 import pytest
 
@@ -10,14 +9,8 @@ from suite import registry, run
 from suite.reporting import QuietReporter
 from tests.tiny import WIDE_CORRIDOR
 
-
-@pytest.fixture(autouse=True, scope="module")
-def hasty_compilation():
-    """Twenty agents are compiled here to run for a moment each."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
+# Twenty agents are compiled here to run for a moment each.
+pytestmark = pytest.mark.usefixtures("hasty_compilation")
 
 # What m6 lacks without one of its parts, m5 lacks too; test_presets says which settings those are.
 AGENTS = sorted(agent for agent in registry.agents() if not agent.startswith("m6_no_"))
