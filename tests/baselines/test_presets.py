@@ -96,6 +96,7 @@ MODEL_NOTES = {
     "world_model.average": 0.0,
     "imagination.min_p": 0.0,
     "imagination.trust": 0.0,
+    "imagination.trust_window": 0,
     "imagination.world": "model",
     "imagination.recent": 0,  # Algorithm 1 samples the whole buffer
     "imagination.context": 0,  # 24
