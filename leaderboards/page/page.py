@@ -211,8 +211,9 @@ def _figures(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str
                 f"{under}: training episodes that unlocked each achievement, the {len(best)} best agents by {label}; "
                 "achievements that none of them unlocked are left out.",
             )
-        if all(len(entry.seeds) > 1 for entry in group):
-            profiles = {entry.config.agent: [entry.scores[score]] for entry in group}
+        several = [entry for entry in group if len(entry.seeds) > 1]  # one run has no share of runs
+        if several:
+            profiles = {entry.config.agent: [entry.scores[score]] for entry in several}
             yield _figure(plots.performance_profiles(profiles, label), f"{under}: the share of runs above a {label}.")
     points = _points(table)
     if len(points) > 1:
