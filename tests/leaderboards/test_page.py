@@ -55,6 +55,18 @@ def test_markup_in_a_cell_is_shown_as_text(made, tmp_path):
     assert "<script>alert" not in html and "&lt;script&gt;alert(1)" in html
 
 
+@pytest.mark.parametrize(("single", "profiles"), [(1, 1), (2, 0)])
+def test_profiles_are_of_agents_with_several_runs(made, tmp_path, single, profiles):
+    """One run has no share of runs; it does not take the profiles of other agents away."""
+    _, tables, standings = made
+    name = "minatar_breakout.csv"
+    found = [s.entry for s in standings if s.entry.config.task == "minatar/breakout"]
+    found = [entry for entry in found if entry.config.preset == "small" and entry.config.agent in ("mfrl", "random")]
+    entries = [Entry(entry.records[:1]) if index < single else entry for index, entry in enumerate(found)]
+    html = write_page(entries, {name: tables[name]}, tmp_path).read_text()
+    assert len(found) == 2 and html.count("the share of runs above") == profiles
+
+
 @pytest.fixture(scope="module")
 def browser():
     sync_api = pytest.importorskip("playwright.sync_api")
