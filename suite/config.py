@@ -137,7 +137,7 @@ class WorldModelConfig:
     # Numbers in a further embedding of the 3x3 tokens around each, of which its own embedding gets a sum; 0: none.
     local_embedding: NotNegative = 0
     action_in_tokens: bool = False  # an embedding of the action is added to every token of its block
-    # Reward and termination are read off every token of a frame too, and not off the action's alone. Patches only.
+    # Reward and termination are read off a frame's tokens too: off every patch by itself, off all symbols together.
     place_heads: bool = False
     # The model is told every token's age, for how many steps its place has shown it, up to so many. 0: it is not told.
     # Only where tokens are patches: symbols of games that people play have no timers.

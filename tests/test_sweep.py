@@ -81,8 +81,9 @@ def until(condition, process=None, seconds=300):
 
 
 def records():
-    """record.json of all runs, by folder."""
-    return {path.parent: json.loads(path.read_text()) for path in Path("runs").rglob("record.json")}
+    """record.json of all runs, by folder. Looked for at its own depth: deeper folders come and go while runs go on."""
+    paths = Path("runs").glob("*/*/*/*/seed_*/record.json")  # family / game / agent / preset
+    return {path.parent: json.loads(path.read_text()) for path in paths}
 
 
 def finished():

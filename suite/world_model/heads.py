@@ -12,16 +12,20 @@ from jax.typing import DTypeLike
 from suite.config import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 
+NARROWER = 4  # so many times fewer numbers a symbol in `SymbolsHead` than in a token's hidden state
+
 
 class Head(nnx.Module):
-    """Dense(D), ReLU, Dense(classes): float32 logits [..., classes] of hidden states [..., D].
+    """Dense(D), ReLU, Dense(classes): float32 logits [..., classes] of hidden states [..., D], or of `inputs` numbers.
 
     Products are in `dtype`; logits are accumulated and kept in float32, since their differences decide what is sampled.
     """
 
-    def __init__(self, config: WorldModelConfig, classes: int, dtype: DTypeLike, rngs: nnx.Rngs):
+    def __init__(
+        self, config: WorldModelConfig, classes: int, dtype: DTypeLike, rngs: nnx.Rngs, inputs: int | None = None
+    ):
         width, init = config.embed_dim, nnx.initializers.normal(config.initial_std)
-        self.hidden = nnx.Linear(width, width, dtype=dtype, kernel_init=init, rngs=rngs)
+        self.hidden = nnx.Linear(inputs or width, width, dtype=dtype, kernel_init=init, rngs=rngs)
         self.kernel = nnx.Param(init(rngs.params(), (width, classes), jnp.float32))
         self.bias = nnx.Param(jnp.zeros((classes,), jnp.float32))
         self.dtype = dtype
@@ -42,6 +46,26 @@ class PlaceHead(Head):
         """From hidden states [..., L, D]."""
         logits = super().__call__(hidden)
         return jax.nn.logsumexp(logits, axis=-2) - math.log(logits.shape[-2])
+
+
+class SymbolsHead(Head):
+    """Logits [..., classes] of all of a frame's symbols together, each of them first made `NARROWER` times narrower.
+
+    A game's winner is a matter of several squares at once, which the sum that attention forms in the action's token
+    tells badly, and which no single place knows. Narrower, because the hidden matrix grows with the number of symbols,
+    and Muon's time with its smaller side. Not the paper's.
+    """
+
+    def __init__(self, config: WorldModelConfig, symbols: int, classes: int, dtype: DTypeLike, rngs: nnx.Rngs):
+        each = max(config.embed_dim // NARROWER, 1)
+        super().__init__(config, classes, dtype, rngs, inputs=symbols * each)
+        init = nnx.initializers.normal(config.initial_std)
+        self.narrow = nnx.Linear(config.embed_dim, each, dtype=dtype, kernel_init=init, rngs=rngs)
+
+    def __call__(self, hidden: jax.Array) -> jax.Array:
+        """From hidden states [..., L, D]."""
+        narrow = self.narrow(hidden)
+        return super().__call__(narrow.reshape(*narrow.shape[:-2], -1))
 
 
 def filled_odds(logits: jax.Array, valid_K: jax.Array) -> jax.Array:

@@ -24,7 +24,7 @@ from suite.interface.tokens import TokenSpec
 from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
 from suite.world_model.dropout import dropout
-from suite.world_model.heads import Head, PlaceHead, TurnHead, TurnLogits, filled_odds
+from suite.world_model.heads import Head, PlaceHead, SymbolsHead, TurnHead, TurnLogits, filled_odds
 
 TERMINATION_CLASSES = 2
 
@@ -116,7 +116,8 @@ class WorldModel(nnx.Module):
         self.norm = layer_norm(width, rngs)
         self.observation_head = Head(config, tokens.token_size or tokens.num_codes, self.dtype, rngs)
         self.seats = 2 if tokens.two_player else 1
-        self.reward_head = Head(config, self.seats * len(tokens.reward_classes), self.dtype, rngs)
+        rewards = self.seats * len(tokens.reward_classes)
+        self.reward_head = Head(config, rewards, self.dtype, rngs)
         self.termination_head = Head(config, TERMINATION_CLASSES, self.dtype, rngs)
         self.turn_head = TurnHead(config, tokens, self.dtype, rngs) if tokens.two_player else None
         # What is not the paper's comes last, so that the rest is initialised as without it.
@@ -129,9 +130,8 @@ class WorldModel(nnx.Module):
         self.token_action_embedding = (
             nnx.Embed(tokens.num_actions, width, embedding_init=init, rngs=rngs) if config.action_in_tokens else None
         )
-        places = config.place_heads and tokens.spatial
-        self.reward_places = PlaceHead(config, len(tokens.reward_classes), self.dtype, rngs) if places else None
-        self.termination_places = PlaceHead(config, TERMINATION_CLASSES, self.dtype, rngs) if places else None
+        self.reward_places = _place_head(config, tokens, rewards, self.dtype, rngs)
+        self.termination_places = _place_head(config, tokens, TERMINATION_CLASSES, self.dtype, rngs)
         self.ages = config.ages if tokens.spatial else 0
         self.age_embedding = nnx.Embed(self.ages + 1, width, embedding_init=init, rngs=rngs) if self.ages else None
 
@@ -306,6 +306,17 @@ class WorldModel(nnx.Module):
         if self.age_embedding is not None and age is not None:
             x = x + self.age_embedding(age)
         return jnp.concatenate([x, self.action_embedding(action)[..., None, :]], axis=-2)
+
+
+def _place_head(
+    config: WorldModelConfig, tokens: TokenSpec, classes: int, dtype: DTypeLike, rngs: nnx.Rngs
+) -> Head | None:
+    """What reads a frame's tokens beside the head that reads its action's token, if the configuration wants that."""
+    if not config.place_heads:
+        return None
+    if tokens.spatial:
+        return PlaceHead(config, classes, dtype, rngs)
+    return SymbolsHead(config, tokens.tokens_per_frame, classes, dtype, rngs)
 
 
 def layer_norm(width: int, rngs: nnx.Rngs) -> nnx.LayerNorm:

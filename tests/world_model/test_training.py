@@ -145,8 +145,26 @@ def test_rewards_and_ends_are_read_off_every_place():
         np.testing.assert_allclose(logits(hidden), expected, rtol=1e-4, atol=1e-5)
         moved = hidden[..., np.array([2, 0, 1, 5, 4, 3, 6]), :]
         np.testing.assert_allclose(logits(moved), logits(hidden), rtol=1e-5, atol=1e-6)  # wherever it happens
-    symbols = WorldModel(small_config(**changes), dataclasses.replace(SPEC, spatial=False), GRID, nnx.Rngs(0))
-    assert symbols.reward_places is None and symbols.termination_places is None
+
+
+def test_rewards_and_ends_of_symbols_are_read_off_all_of_them():
+    """Beside what the action's token says: one network of all the frame's symbols, whose order matters."""
+    config = small_config(place_heads=True, dropout=0.0, initial_std=0.2)
+    model = WorldModel(config, dataclasses.replace(SPEC, spatial=False), None, nnx.Rngs(0))
+    hidden = model(SEQUENCES.tokens_BTL[:, :-1], SEQUENCES.action_BT)
+    pairs = (
+        (model.reward_logits, model.reward_head, model.reward_places),
+        (model.termination_logits, model.termination_head, model.termination_places),
+    )
+    for logits, head, symbols in pairs:
+        narrow = [symbols.narrow(hidden[..., place, :]) for place in range(model.block - 1)]
+        assert {each.shape[-1] for each in narrow} == {config.embed_dim // 4}
+        expected = head(hidden[..., -1, :]) + Head.__call__(symbols, np.concatenate(narrow, axis=-1))
+        np.testing.assert_allclose(logits(hidden), expected, rtol=1e-4, atol=1e-5)
+        moved = hidden[..., np.array([2, 0, 1, 5, 4, 3, 6]), :]
+        assert np.abs(np.asarray(logits(moved) - logits(hidden))).max() > 1e-3
+    without = WorldModel(small_config(), dataclasses.replace(SPEC, spatial=False), None, nnx.Rngs(0))
+    assert without.reward_places is None and without.termination_places is None
 
 
 def test_dropout_follows_the_key():
