@@ -18,6 +18,8 @@ TWO_PLAYERS = ("openspiel/", "pettingzoo/")
 NIGHT_THRESHOLD = 0.5
 AGES = 15  # longer than the timers of MinAtar's games
 MUON_LEARNING_RATE = 0.003
+# Of games of two players: there all that follows from a position is certain, and a model can be right to the last game.
+GAMES_LEARNING_RATE = 0.001
 AVERAGE = 0.99  # over a hundred gradient steps or so
 TRUST = 0.7  # where models knew more of the rewards, dreams helped or did nothing; where they knew less, they did harm
 
@@ -31,6 +33,7 @@ PARTS: dict[str, Part] = {
     "places": lambda config: {"world_model.place_heads": True},
     "ages": lambda config: {"world_model.ages": _ages(config)},
     "muon": lambda config: {"world_model.optimizer": "muon", "world_model.learning_rate": MUON_LEARNING_RATE},
+    "games": lambda config: _patient(config) if config.task.startswith(TWO_PLAYERS) else {},
     "average": lambda config: {"world_model.average": AVERAGE},
     "codes": lambda config: _finer_codes(config) if config.task.startswith("craftax") else {},
     "trust": lambda config: {"imagination.trust": TRUST},
@@ -40,11 +43,11 @@ PARTS: dict[str, Part] = {
 def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
-    Eleven parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an
+    Twelve parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an
     embedding of the tokens around each one, the action added to every token, rewards and ends that are read off every
-    token, the age of every token, another optimizer of the model, dreams with averaged parameters and, in games of two
-    players, without improbable tokens, on Craftax a finer codebook, and no dreams while the model does not foresee
-    rewards.
+    token, the age of every token, another optimizer of the model, which in games of two players is slower and surer,
+    dreams with averaged parameters and, in games of two players, without improbable tokens, on Craftax a finer
+    codebook, and no dreams while the model does not foresee rewards.
     """
     return _with_parts(config, PARTS)
 
@@ -69,6 +72,11 @@ def _ages(config: Config) -> int:
 
 def _finer_codes(config: Config) -> dict[str, Any]:
     return {"tokenizer.threshold": NIGHT_THRESHOLD, "tokenizer.codebook_size": 2 * config.tokenizer.codebook_size}
+
+
+def _patient(config: Config) -> dict[str, Any]:
+    sequences = 2 * config.world_model.sequences
+    return {"world_model.learning_rate": GAMES_LEARNING_RATE, "world_model.sequences": sequences}
 
 
 def _with_parts(config: Config, parts: Mapping[str, Part]) -> Config:

@@ -279,6 +279,7 @@ AGENTS = (
             ("places", "that reads rewards and ends off the action's token alone"),
             ("ages", "that does not know how long anything has been where it is"),
             ("muon", "whose world model learns by Adam, as in m5"),
+            ("games", "whose world model learns games of two players as fast as all else"),
             ("average", "that dreams with the newest parameters"),
             ("codes", "with the codebook of m5 on Craftax"),
             ("trust", "that dreams whatever its model knows of rewards"),

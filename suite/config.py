@@ -131,7 +131,7 @@ class WorldModelConfig:
     dropout: Rate = 0.1  # embedding, attention and residual
     initial_std: PositiveFloat = 0.02  # of every kernel and embedding, GPT-2's; narrow models learn faster from more
     positions: Literal["flat", "grid"] = "flat"  # RoPE over the token index, or over (time, row, column): note 20
-    # This and the next five are not the paper's (docs/agents.md): copy tokens from near their place, or make them new.
+    # This and the next six are not the paper's (docs/agents.md): copy tokens from near their place, or make them new.
     correspondence: bool = False
     correspondence_radius: NotNegative = 1  # of the square that is copied from; symbols: their own place alone
     # Numbers in a further embedding of the 3x3 tokens around each, of which its own embedding gets a sum; 0: none.
@@ -142,6 +142,8 @@ class WorldModelConfig:
     # The model is told every token's age, for how many steps its place has shown it, up to so many. 0: it is not told.
     # Only where tokens are patches: symbols of games that people play have no timers.
     ages: NotNegative = 0
+    # Embeddings and logits of a code are its own and a linear map of the patch that it stands for.
+    patch_contents: bool = False
     # Symbols are embedded by value and place, since the same value means different things in different places; the
     # paper does not say. false: by value alone, as patches are.
     symbol_places: bool = True
@@ -316,6 +318,8 @@ def _problems(config: Config) -> Iterator[str]:
         yield f"world_model.embed_dim / world_model.heads = {model.embed_dim / model.heads:g} must be even (RoPE)"
     if config.policy.kind == "moon" and (config.policy.rnn_size or not config.policy.embedding_size):
         yield "policy.kind=moon has no memory and an embedding: policy.rnn_size=0, and policy.embedding_size above 0"
+    if model.patch_contents and config.tokenizer.kind != "nearest_neighbor":
+        yield "world_model.patch_contents=true needs codes that are patches: tokenizer.kind=nearest_neighbor"
     for name, used in (("correspondence=true", model.correspondence), (f"ages={model.ages}", model.ages)):
         if used and (not model.block_teacher_forcing or config.tokenizer.kind == "continuous"):
             yield (

@@ -68,6 +68,7 @@ def build_tokenizer(config: Config, spec: EnvironmentSpec) -> tuple[Tokenizer, T
         chance_outcomes=spec.chance_outcomes,
         token_size=tokenizer.token_size,
         spatial=spec.observation.kind != "symbols",
+        content_size=jax.eval_shape(lambda: tokenizer.contents(tokenizer.init(jax.random.key(0)))).shape[1],
     )
     return tokenizer, tokens, (players * rows, columns)
 
@@ -235,6 +236,8 @@ class Agent:
     ) -> tuple[world_model_training.WorldModelLearner, Metrics]:
         """Step 3, second half (Algorithm 5): the transformer learns from replayed sequences of T_WM + 1 frames."""
         config, plan = self.config.world_model, self.config.imagination
+        if config.patch_contents and self.tokens.content_size:
+            learner = learner.shown(self.tokenizer.contents(tokenizer))
         if learner.measured is not None:
             new = self._measure(learner.dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
             measured = learner.measured + (new - learner.measured) / plan.trust_window

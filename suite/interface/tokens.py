@@ -27,6 +27,7 @@ class TokenSpec:
       chance_outcomes: C of a two-player game.
       token_size: numbers in a token that is no code but a vector; 0: tokens are codes.
       spatial: tokens are patches of a picture, whose neighbours in the grid are neighbours in what is shown.
+      content_size: P, numbers in what a code stands for (`Tokenizer.contents`); 0: nothing is known of it.
     """
 
     tokens_per_frame: int
@@ -38,6 +39,7 @@ class TokenSpec:
     chance_outcomes: int = 0
     token_size: int = 0
     spatial: bool = True
+    content_size: int = 0
 
     @property
     def two_player(self) -> bool:
@@ -95,6 +97,9 @@ class Tokenizer(Protocol):
 
     def valid_codes(self, state: TokenizerState) -> jax.Array:
         """Bool [K]: codes that have a meaning; the others must never be sampled."""
+
+    def contents(self, state: TokenizerState) -> jax.Array:
+        """float32 [K, P]: what each code stands for, in numbers from 0 to 1; P = 0 where codes are only names."""
 
 
 def encode_frame(tokenizer: Tokenizer, state: TokenizerState, observation: jax.Array, turn: Turn | None) -> jax.Array:

@@ -74,3 +74,8 @@ class ContinuousTokenizer:
         """Bool [0]."""
         del state
         return jnp.ones(0, bool)
+
+    def contents(self, state: dict[str, jax.Array]) -> jax.Array:
+        """[0, 0]: there are no codes."""
+        del state
+        return jnp.zeros((0, 0), jnp.float32)

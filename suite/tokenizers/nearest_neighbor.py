@@ -136,6 +136,10 @@ class NearestNeighborTokenizer:
         """Bool [K]: the codes that are filled."""
         return jnp.arange(self.codebook_size) < state.count
 
+    def contents(self, state: NearestNeighborState) -> jax.Array:
+        """float32 [K, P]: the stored patches; zeros of codes that are not filled."""
+        return state.codes_KP.astype(jnp.float32) / self.observation.high
+
     def _nearest(self, state: NearestNeighborState, patches_MP: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Squared distance (in units of 1/high**2) and index of each patch's nearest code; infinity where none is."""
         codes_KP = state.codes_KP.astype(jnp.float32)

@@ -70,3 +70,8 @@ class SymbolTokenizer:
         """Bool [K]: all."""
         del state
         return jnp.ones(self.num_codes, bool)
+
+    def contents(self, state: dict[str, jax.Array]) -> jax.Array:
+        """P = 0: the value of a symbol is its name."""
+        del state
+        return jnp.zeros((self.num_codes, 0), jnp.float32)

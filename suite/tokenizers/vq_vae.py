@@ -164,6 +164,11 @@ class VQTokenizer:
         del state
         return jnp.ones(self.num_codes, bool)
 
+    def contents(self, state: VQState) -> jax.Array:
+        """P = 0: what a code stands for changes while it is learned, and depends on its neighbours."""
+        del state
+        return jnp.zeros((self.num_codes, 0), jnp.float32)
+
     @functools.cached_property
     def _graph(self) -> Any:
         return nnx.graphdef(nnx.eval_shape(lambda: self._new(nnx.Rngs(0))))

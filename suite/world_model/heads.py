@@ -31,8 +31,13 @@ class Head(nnx.Module):
         self.dtype = dtype
 
     def __call__(self, hidden: jax.Array) -> jax.Array:
+        return self.logits(hidden)
+
+    def logits(self, hidden: jax.Array, more: jax.Array | None = None) -> jax.Array:
+        """The same; `more`, [D, classes], is added to the matrix that logits are read off with."""
         features = nnx.relu(self.hidden(hidden))
-        logits = jnp.dot(features, self.kernel[...].astype(self.dtype), preferred_element_type=jnp.float32)
+        kernel = self.kernel[...] if more is None else self.kernel[...] + more
+        logits = jnp.dot(features, kernel.astype(self.dtype), preferred_element_type=jnp.float32)
         return logits + self.bias[...].reshape((1,) * (logits.ndim - 1) + (-1,))
 
 

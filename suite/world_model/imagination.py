@@ -164,7 +164,7 @@ def sample_one_by_one(
     """
 
     def sample(key: jax.Array, hidden_BD: jax.Array) -> tuple[jax.Array, jax.Array]:
-        logits_BK = model.observation_head(hidden_BD)
+        logits_BK = model.code_logits(hidden_BD)
         token_B1 = draw(key, filled_odds(logits_BK[:, None], valid_K))
         log_BK = jax.nn.log_softmax(jnp.where(valid_K[None], logits_BK, -jnp.inf))
         return token_B1[:, 0], jnp.take_along_axis(log_BK, token_B1, axis=1)[:, 0]

@@ -83,6 +83,18 @@ class WorldModelLearner:
         """That of an untrained model."""
         return cls(params, optimizer.init(params), jax.tree.map(jnp.copy, params) if config.average else None)
 
+    def shown(self, contents_KP: jax.Array) -> WorldModelLearner:
+        """The same with models that know these `Tokenizer.contents`, which training leaves as they are."""
+
+        def show(params: Any) -> Any:
+            def leaf(path: Any, array: jax.Array) -> jax.Array:
+                return contents_KP if path[0].key == "contents" else array
+
+            return jax.tree_util.tree_map_with_path(leaf, params)
+
+        averaged = None if self.averaged is None else show(self.averaged)
+        return self.replace(params=show(self.params), averaged=averaged)  # type: ignore[attr-defined]
+
     @property
     def dreaming(self) -> Any:
         """The parameters that dreams use."""

@@ -87,6 +87,10 @@ def _stacked_layers(config: WorldModelConfig, dtype: DTypeLike, rngs: nnx.Rngs) 
     return create(rngs)
 
 
+class Contents(nnx.Variable):
+    """What each code stands for (`Tokenizer.contents`): given by the tokenizer, not learned."""
+
+
 class WorldModel(nnx.Module):
     """Predicts the next frame's tokens, the reward's class and termination from tokens and actions.
 
@@ -134,6 +138,14 @@ class WorldModel(nnx.Module):
         self.termination_places = _place_head(config, tokens, TERMINATION_CLASSES, self.dtype, rngs)
         self.ages = config.ages if tokens.spatial else 0
         self.age_embedding = nnx.Embed(self.ages + 1, width, embedding_init=init, rngs=rngs) if self.ages else None
+        # What codes stand for, and what embeddings and logits make of it: nothing before training.
+        content = tokens.content_size if config.patch_contents else 0
+        self.contents = Contents(jnp.zeros((codes, content), jnp.float32)) if content else None
+
+        def reading(numbers: int) -> nnx.Param | None:
+            return nnx.Param(jnp.zeros((content, numbers), jnp.float32)) if content and numbers else None
+
+        self.content_embedding, self.content_local, self.content_logits = map(reading, (width, local, width))
 
     def __call__(
         self,
@@ -181,8 +193,13 @@ class WorldModel(nnx.Module):
         Where tokens are vectors these are the predicted tokens themselves, K numbers each.
         """
         if self.config.block_teacher_forcing:
-            return self.observation_head(hidden[..., :-1, :])
-        return self.observation_head(jnp.concatenate([hidden[..., :-2, :], hidden[..., -1:, :]], axis=-2))
+            return self.code_logits(hidden[..., :-1, :])
+        return self.code_logits(jnp.concatenate([hidden[..., :-2, :], hidden[..., -1:, :]], axis=-2))
+
+    def code_logits(self, hidden: jax.Array) -> jax.Array:
+        """float32 [..., K]: of one token each, or what it is, from the hidden states [..., D] that predict it."""
+        content_KD = self._of_contents(self.content_logits)
+        return self.observation_head.logits(hidden, None if content_KD is None else content_KD.T)
 
     def observation_targets(self, frame: jax.Array, following: jax.Array) -> jax.Array:
         """What `observation_logits` are of: the following frame, or the rest of this one and that one's first token.
@@ -263,7 +280,8 @@ class WorldModel(nnx.Module):
     def append_token(self, cache: Cache, token_B: jax.Array, place: jax.Array) -> tuple[Cache, jax.Array]:
         """Appends one token of a frame, the one at `place` (int32 scalar) of L; its hidden state [B, D]."""
         assert isinstance(self.token_embedding, nnx.Embed)
-        cache, hidden_B1D = self._append(cache, self.token_embedding(token_B + place * self.codes_per_place)[:, None])
+        x_BD = self._token_embedding(token_B + place * self.codes_per_place)
+        cache, hidden_B1D = self._append(cache, x_BD[:, None])
         return cache, hidden_B1D[:, 0]
 
     def _append(self, cache: Cache, x_BQD: jax.Array) -> tuple[Cache, jax.Array]:
@@ -293,13 +311,25 @@ class WorldModel(nnx.Module):
     def _positions(self, index_S: jax.Array) -> jax.Array:
         return token_positions(self.config.positions, index_S, self.block, self.grid)
 
+    def _token_embedding(self, tokens: jax.Array) -> jax.Array:
+        if isinstance(self.token_embedding, nnx.Linear):
+            return self.token_embedding(tokens)
+        return _looked_up(self.token_embedding, self._of_contents(self.content_embedding), tokens)
+
+    def _of_contents(self, reading: nnx.Param | None) -> jax.Array | None:
+        """What a reading [P, N] makes of what codes stand for, [K, N]."""
+        if reading is None or self.contents is None:
+            return None
+        return jax.lax.stop_gradient(self.contents[...]) @ reading[...]
+
     def _embed(self, tokens: jax.Array, action: jax.Array, age: jax.Array | None) -> jax.Array:
         if self.codes_per_place:
             places = self.codes_per_place * jnp.arange(tokens.shape[-1])
             tokens = tokens + places.reshape((1,) * (tokens.ndim - 1) + (-1,))
-        x = self.token_embedding(tokens)
+        x = self._token_embedding(tokens)
         if self.local_embedding is not None and self.local_mix is not None and self.grid is not None:
-            around = neighbourhood(self.local_embedding(tokens), self.grid, 1, tokens.ndim - 1)
+            local = _looked_up(self.local_embedding, self._of_contents(self.content_local), tokens)
+            around = neighbourhood(local, self.grid, 1, tokens.ndim - 1)
             x = x + self.local_mix(around.reshape(*tokens.shape, -1))
         if self.token_action_embedding is not None:
             x = x + self.token_action_embedding(action)[..., None, :]
@@ -317,6 +347,11 @@ def _place_head(
     if tokens.spatial:
         return PlaceHead(config, classes, dtype, rngs)
     return SymbolsHead(config, tokens.tokens_per_frame, classes, dtype, rngs)
+
+
+def _looked_up(table: nnx.Embed, more: jax.Array | None, index: jax.Array) -> jax.Array:
+    """Rows [..., N] of a table [K, N], to which perhaps another is added."""
+    return table(index) if more is None else (table.embedding[...] + more)[index]
 
 
 def layer_norm(width: int, rngs: nnx.Rngs) -> nnx.LayerNorm:

@@ -51,7 +51,8 @@ def test_the_window_needs_trust():
 def test_the_newest_steps_measure_a_model_that_has_not_learned_from_them(monkeypatch, hasty_compilation):
     """The buffer holds two iterations: no step of the first one pays, every step of the second one does."""
     monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
-    config = registry.resolve("wide_corridor", "m5", "smoke", ["imagination.trust=0.7", "imagination.trust_window=2"])
+    changes = ["imagination.trust=0.7", "imagination.trust_window=2", "world_model.patch_contents=true"]
+    config = registry.resolve("wide_corridor", "m5", "smoke", changes)
     agent = Agent(config, WideCorridor())
     state = agent.init(jax.random.key(0))
     _, trajectory, _ = agent.collect(state.learner.acting, state.player, jax.random.key(1))
@@ -59,13 +60,17 @@ def test_the_newest_steps_measure_a_model_that_has_not_learned_from_them(monkeyp
     for reward in (0, 1):
         paid = dataclasses.replace(trajectory, reward_TB=jnp.full_like(trajectory.reward_TB, reward))
         replay = agent.remember(replay, paid)
+    tokenizer, _ = agent.update_tokenizer(state.tokenizer, replay, jax.random.key(3))
+    contents_KP = agent.tokenizer.contents(tokenizer)
+    assert np.asarray(contents_KP).any()
     learner, expected = state.world_model, jnp.zeros(3)
     measure = jax.jit(agent._measure)
     for key in jax.random.split(jax.random.key(2), 2):
-        now = measure(learner.dreaming, state.tokenizer, replay, jax.random.fold_in(key, 0))
+        now = measure(learner.shown(contents_KP).dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
         np.testing.assert_array_equal(now[1:], [0, 1])
         expected = expected + (now - expected) / 2
-        learner, metrics = agent.update_world_model(learner, state.tokenizer, replay, key)
+        learner, metrics = agent.update_world_model(learner, tokenizer, replay, key)
         np.testing.assert_allclose(learner.measured, expected, rtol=1e-5)
+        np.testing.assert_array_equal(learner.dreaming["contents"][...], contents_KP)
         assert metrics["reward_known"] == 0  # for all rewards that were measured are alike
     assert metrics["reward_loss"] < now[0]  # half of the steps that it learned from pay, and it had begun to say so

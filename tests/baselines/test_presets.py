@@ -86,12 +86,13 @@ MODEL_NOTES = {
     "world_model.enabled": True,
     "world_model.positions": "flat",  # 20
     "world_model.mask_after_done": False,  # 21
-    "world_model.correspondence": False,  # this and the next four are not the paper's
+    "world_model.correspondence": False,  # this and the next six are not the paper's
     "world_model.correspondence_radius": 1,
     "world_model.local_embedding": 0,
     "world_model.action_in_tokens": False,
     "world_model.place_heads": False,
     "world_model.ages": 0,
+    "world_model.patch_contents": False,
     "world_model.optimizer": "adam",  # 23
     "world_model.average": 0.0,
     "imagination.min_p": 0.0,
@@ -179,6 +180,7 @@ M6 = {
     "places": {"world_model.place_heads": True},
     "ages": {"world_model.ages": 15},
     "muon": {"world_model.optimizer": "muon", "world_model.learning_rate": 0.003},
+    "games": {},  # of two players alone
     "average": {"world_model.average": 0.99},
     "codes": {"tokenizer.threshold": 0.5, "tokenizer.codebook_size": 8192},
     "trust": {"imagination.trust": 0.7},
@@ -229,6 +231,13 @@ def test_an_agent_differs_in_what_defines_it_and_in_nothing_else(base, agent, ch
 def test_m6_dreams_what_is_improbable_but_in_games_of_two_players(task, least):
     assert registry.resolve(task, "m6", "small").imagination.min_p == least
     assert registry.resolve(task, "m6_no_min_p", "small").imagination.min_p == 0
+
+
+def test_m6_learns_games_of_two_players_from_more_at_a_lower_rate():
+    for task, preset in (("openspiel/tic_tac_toe", "small"), ("openspiel/bargaining", "paper")):
+        model, plain = (registry.resolve(task, agent, preset).world_model for agent in ("m6", "m6_no_games"))
+        assert (model.learning_rate, plain.learning_rate) == (0.001, 0.003)
+        assert model.sequences == 2 * plain.sequences
 
 
 @pytest.mark.parametrize(("task", "threshold", "size"), [("craftax_full", 0.5, 1024), ("minatar/breakout", 0.75, 512)])
