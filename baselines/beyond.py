@@ -21,13 +21,16 @@ MUON_LEARNING_RATE = 0.003
 # Of games of two players: there all that follows from a position is certain, and a model can be right to the last game.
 GAMES_LEARNING_RATE = 0.001
 AVERAGE = 0.99  # over a hundred gradient steps or so
-TRUST = 0.7  # where models knew more of the rewards, dreams helped or did nothing; where they knew less, they did harm
+# Where models knew so much of the rewards of steps that they had not learned from, dreams helped or did nothing.
+TRUST = 0.5
+TRUST_WINDOW = 10  # iterations; on Asterix there are some ten rewards in one
 
 # Each part of M6 by name: what it changes of M5.
 PARTS: dict[str, Part] = {
     "correspondence": lambda config: {"world_model.correspondence": True},
     "grid": lambda config: {"world_model.positions": "grid"},
     "local": lambda config: {"world_model.local_embedding": LOCAL_EMBEDDING},
+    "contents": lambda config: {"world_model.patch_contents": True} if config.task.startswith("minatar/") else {},
     "action": lambda config: {"world_model.action_in_tokens": True},
     "min_p": lambda config: {"imagination.min_p": MIN_P} if config.task.startswith(TWO_PLAYERS) else {},
     "places": lambda config: {"world_model.place_heads": True},
@@ -36,15 +39,15 @@ PARTS: dict[str, Part] = {
     "games": lambda config: _patient(config) if config.task.startswith(TWO_PLAYERS) else {},
     "average": lambda config: {"world_model.average": AVERAGE},
     "codes": lambda config: _finer_codes(config) if config.task.startswith("craftax") else {},
-    "trust": lambda config: {"imagination.trust": TRUST},
+    "trust": lambda config: {"imagination.trust": TRUST, "imagination.trust_window": TRUST_WINDOW},
 }
 
 
 def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
-    Twelve parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an
-    embedding of the tokens around each one, the action added to every token, rewards and ends that are read off every
+    Thirteen parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an
+    embedding of the tokens around each one, in MinAtar the patches that codes stand for, the action added to every token, rewards and ends that are read off every
     token, the age of every token, another optimizer of the model, which in games of two players is slower and surer,
     dreams with averaged parameters and, in games of two players, without improbable tokens, on Craftax a finer
     codebook, and no dreams while the model does not foresee rewards.

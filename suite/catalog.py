@@ -274,6 +274,7 @@ AGENTS = (
             ("correspondence", "that makes every token anew"),
             ("grid", "with positions along the stream, as in m5"),
             ("local", "that embeds each token alone"),
+            ("contents", "that knows MinAtar's codes by their names alone, and not what they stand for"),
             ("action", "whose action is a token and nothing more"),
             ("min_p", "whose dreams of games of two players hold improbable tokens too"),
             ("places", "that reads rewards and ends off the action's token alone"),

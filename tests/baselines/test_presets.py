@@ -175,6 +175,7 @@ M6 = {
     "correspondence": {"world_model.correspondence": True},
     "grid": {"world_model.positions": "grid"},
     "local": {"world_model.local_embedding": 16},
+    "contents": {},  # of MinAtar alone
     "action": {"world_model.action_in_tokens": True},
     "min_p": {},  # of games of two players alone
     "places": {"world_model.place_heads": True},
@@ -183,7 +184,7 @@ M6 = {
     "games": {},  # of two players alone
     "average": {"world_model.average": 0.99},
     "codes": {"tokenizer.threshold": 0.5, "tokenizer.codebook_size": 8192},
-    "trust": {"imagination.trust": 0.7},
+    "trust": {"imagination.trust": 0.5, "imagination.trust_window": 10},
 }
 
 
@@ -231,6 +232,12 @@ def test_an_agent_differs_in_what_defines_it_and_in_nothing_else(base, agent, ch
 def test_m6_dreams_what_is_improbable_but_in_games_of_two_players(task, least):
     assert registry.resolve(task, "m6", "small").imagination.min_p == least
     assert registry.resolve(task, "m6_no_min_p", "small").imagination.min_p == 0
+
+
+def test_m6_knows_what_codes_look_like_in_minatar_alone():
+    for task in ("minatar/asterix", "craftax_classic", "openspiel/leduc"):
+        found = [registry.resolve(task, agent, "small").world_model.patch_contents for agent in ("m6", "m6_no_contents")]
+        assert found == [task == "minatar/asterix", False]
 
 
 def test_m6_learns_games_of_two_players_from_more_at_a_lower_rate():
