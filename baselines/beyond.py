@@ -47,10 +47,10 @@ def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
     Thirteen parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an
-    embedding of the tokens around each one, in MinAtar the patches that codes stand for, the action added to every token, rewards and ends that are read off every
-    token, the age of every token, another optimizer of the model, which in games of two players is slower and surer,
-    dreams with averaged parameters and, in games of two players, without improbable tokens, on Craftax a finer
-    codebook, and no dreams while the model does not foresee rewards.
+    embedding of the tokens around each one, in MinAtar the patches that codes stand for, the action added to every
+    token, rewards and ends that are read off every token, the age of every token, another optimizer of the model, which
+    in games of two players is slower and surer, dreams with averaged parameters and, in games of two players, without
+    improbable tokens, on Craftax a finer codebook, and no dreams while the model does not foresee rewards.
     """
     return _with_parts(config, PARTS)
 

@@ -236,8 +236,8 @@ def test_m6_dreams_what_is_improbable_but_in_games_of_two_players(task, least):
 
 def test_m6_knows_what_codes_look_like_in_minatar_alone():
     for task in ("minatar/asterix", "craftax_classic", "openspiel/leduc"):
-        found = [registry.resolve(task, agent, "small").world_model.patch_contents for agent in ("m6", "m6_no_contents")]
-        assert found == [task == "minatar/asterix", False]
+        m6, without = (registry.resolve(task, agent, "small").world_model for agent in ("m6", "m6_no_contents"))
+        assert (m6.patch_contents, without.patch_contents) == (task == "minatar/asterix", False)
 
 
 def test_m6_learns_games_of_two_players_from_more_at_a_lower_rate():
