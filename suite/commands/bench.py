@@ -14,6 +14,9 @@ SUMMARY = "time, share and speed of each phase"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_configuration(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress")
+    parser.add_argument(
+        "--no-start-up", action="store_true", help="do not start the command twice, to measure how long that takes"
+    )
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -25,7 +28,7 @@ def execute(args: argparse.Namespace) -> int:
 
     if not args.quiet:
         print(f"{config.task}, agent {config.agent}, preset {config.preset}, on {device_name()}", flush=True)
-    measured = bench.bench(config, make_reporter(args.quiet))
+    measured = bench.bench(config, make_reporter(args.quiet), start_up=not args.no_start_up)
     parts = measured if isinstance(measured, Mapping) else {"phases": measured}
     for name, part in parts.items():
         if isinstance(part, list):
