@@ -26,6 +26,7 @@ FAST_TESTS = ("tests/world_model", "tests/policy", "tests/tokenizers", "tests/ag
 TEST_MINUTES = 2.0
 BENCHES = (("craftax_classic", "mfrl"), ("craftax_classic", "m5"))
 RUNS = (("craftax_classic", "mfrl"), ("openspiel/tic_tac_toe", "m5"))
+BENCH = 0.35  # of the minutes that are left, for one at most
 FIRST_RUN = 0.7  # of the minutes that are left for runs, unless it is finished earlier
 LAST_CHECKPOINT = 60.0  # seconds that a run which is told to stop may take to finish its iteration and save
 KEPT = ("config.json", "record.json", "metrics.csv", "episodes.csv", "evaluations.csv", "timing.csv")
@@ -65,7 +66,7 @@ def main(
         failed.append("tests")
     for task, agent in benches:
         path = args.out / f"bench_{task.replace('/', '_')}_{agent}.json"
-        if not _bench(path, [task, "--agent", agent, "--preset", args.preset], left(), environment):
+        if not _bench(path, [task, "--agent", agent, "--preset", args.preset], BENCH * left(), environment):
             failed.append(path.stem)
     for index, (task, agent) in enumerate(runs):
         seconds = left() * (1.0 if index == len(runs) - 1 else FIRST_RUN) - LAST_CHECKPOINT
@@ -115,7 +116,7 @@ def _bench(path: Path, words: Sequence[str], seconds: float, environment: dict[s
     command = [sys.executable, "-m", "suite.cli", "bench", *words, "--quiet", "--json", "--no-start-up"]
     code, lines, took = _timed(command, seconds, environment)
     if code is None:
-        print("  not in the time that was left", flush=True)
+        print(f"  not in {seconds:.0f} s", flush=True)
         return True
     if code:
         print(*lines[-10:], sep="\n", file=sys.stderr)
