@@ -29,6 +29,7 @@ RUNS = (("craftax_classic", "mfrl"), ("openspiel/tic_tac_toe", "m5"))
 BENCH = 0.35  # of the minutes that are left, for one at most
 FIRST_RUN = 0.7  # of the minutes that are left for runs, unless it is finished earlier
 LAST_CHECKPOINT = 60.0  # seconds that a run which is told to stop may take to finish its iteration and save
+STOPPED = 130  # the exit code of a run that stopped with a checkpoint
 KEPT = ("config.json", "record.json", "metrics.csv", "episodes.csv", "evaluations.csv", "timing.csv")
 
 Parts = Sequence[tuple[str, str]]
@@ -136,13 +137,12 @@ def _run(words: Sequence[str], seconds: float, environment: dict[str, str]) -> b
         except subprocess.TimeoutExpired:
             run.send_signal(signal.SIGTERM)
             try:
-                output, _ = run.communicate(timeout=LAST_CHECKPOINT)
-            except subprocess.TimeoutExpired:  # it was still compiling: nothing of it is lost
+                run.communicate(timeout=LAST_CHECKPOINT)
+            except subprocess.TimeoutExpired:  # it was compiling, or in an iteration that takes longer
                 run.kill()
-                output, _ = run.communicate()
-                print("  killed before its first checkpoint", flush=True)
-                return True
-            print("  stopped with a checkpoint", flush=True)
+                run.communicate()
+            saved = run.returncode == STOPPED
+            print("  stopped with a checkpoint" if saved else "  ended before it could save", flush=True)
             return True
     if run.returncode:
         print(output.decode(errors="replace"), file=sys.stderr)
