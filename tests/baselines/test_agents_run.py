@@ -27,7 +27,7 @@ def test_two_iterations(task, agent, tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
     # An m6 of two iterations knows nothing of rewards: it does not dream in the corridor, and is made to on the board.
     distrusts = (task, agent) == ("wide_corridor", "m6")
-    overrides = ["imagination.trust=0"] if agent == "m6" and not distrusts else []
+    overrides = ["imagination.trust=0", "imagination.trust_window=0"] if agent == "m6" and not distrusts else []
     config = registry.resolve(task, agent, "smoke", overrides)
     result = run.run(config, tmp_path, QuietReporter())
     assert (result.status, result.steps) == ("finished", config.protocol.steps)
