@@ -306,7 +306,10 @@ def _problems(config: Config) -> Iterator[str]:
     if dream.world == "game" and model.enabled:
         yield "imagination.world=game has no use for a world model: world_model.enabled=false"
     if dream.trust_window and not dream.trust:
-        yield f"imagination.trust_window={dream.trust_window} measures what imagination.trust=0 does not ask for, so it must be 0"
+        yield (
+            f"imagination.trust_window={dream.trust_window} measures what imagination.trust=0 does not ask for, so it "
+            "must be 0 too"
+        )
     if dream.world == "game" and dream.trust:
         yield "imagination.world=game needs no trust, for its rewards are the true ones: imagination.trust=0"
     if dream.world == "model" and dream.horizon + dream.context > model.sequence_length:
