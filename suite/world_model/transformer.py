@@ -63,12 +63,12 @@ class Block(nnx.Module):
         self.contract = dense(4 * width, width)
 
     def attention_inputs(self, x: jax.Array) -> list[jax.Array]:
-        """Queries, keys and values [B, S, N, H] of the stream [B, S, D]."""
+        """Queries, keys and values [..., N, H] of the stream [..., D]."""
         mixed = self.query_key_value(self.attention_norm(x))
         return [part.reshape(*x.shape[:-1], self.heads, -1) for part in jnp.split(mixed, 3, axis=-1)]
 
     def add(self, x: jax.Array, attended: jax.Array, dropout_key: jax.Array | None) -> jax.Array:
-        """The stream [B, S, D] after the attention's result [B, S, N, H] and the MLP are added to it."""
+        """The stream [..., D] after the attention's result [..., N, H] and the MLP are added to it."""
         attention_key, mlp_key = _split(dropout_key, 2)
         update = self.projection(attended.reshape(x.shape)).astype(x.dtype)
         x = x + dropout(update, self.rate, attention_key)
@@ -161,7 +161,8 @@ class WorldModel(nnx.Module):
         batch, steps = action_BT.shape
         rate = self.config.dropout
         embedding_key, layer_key = _split(dropout_key, 2)
-        x = self._embed(tokens_BTL, action_BT, age_BTL).reshape(batch, steps * self.block, -1)
+        # All tokens along one axis: on a CPU, a bias's gradient, a sum over two axes, takes several times as long.
+        x = self._embed(tokens_BTL, action_BT, age_BTL).reshape(batch * steps * self.block, -1)
         position_SA = self._positions(jnp.arange(steps * self.block))
         graphdef, layers = nnx.split(self.layers)
 
@@ -170,7 +171,7 @@ class WorldModel(nnx.Module):
             layer = nnx.merge(graphdef, params)
             key = None if layer_key is None else jax.random.fold_in(layer_key, index)
             attention_key, residual_key = _split(key, 2)
-            query, key_, value = layer.attention_inputs(x)
+            query, key_, value = (y.reshape(batch, -1, *y.shape[1:]) for y in layer.attention_inputs(x))
             attended = causal_attention(
                 rope(query, position_SA),
                 rope(key_, position_SA),

@@ -49,6 +49,31 @@ def test_max_pool_has_the_gradient_of_flax_max_pool():
     np.testing.assert_allclose(ours, theirs, rtol=1e-6)
 
 
+def test_of_equal_values_one_alone_takes_the_gradient_of_max_pool():
+    weight = random(2, 4, 3, 3, seed=1)
+    slope = jax.grad(lambda x: (weight * networks.max_pool(x)).sum())(jnp.zeros((2, 7, 6, 3)))
+    np.testing.assert_allclose(slope.sum((1, 2)), weight.sum((1, 2)), rtol=1e-5)
+    assert int((slope != 0).sum()) == weight.size
+
+
+@pytest.mark.parametrize("axes", [(1, 2), (0, 1, 2), (1, 2, 3)])
+def test_a_convolution_of_images_is_that_of_the_normalised_images_with_its_gradients(axes):
+    images, weight = random(3, 5, 4, 3), random(3, 5, 4, 6, seed=1)
+    conv, norm = networks.Conv3x3(3, 6, jnp.float32, nnx.Rngs(0)), networks.Norm(3, axes, jnp.float32)
+    conv.bias[...] = random(6, seed=2)
+    norm.scale[...], norm.bias[...] = random(3, seed=3), random(3, seed=4)
+    layers = nnx.Dict(conv=conv, norm=norm)
+    graphdef, params = nnx.split(layers)
+
+    def value_and_grads(function):
+        return jax.value_and_grad(lambda p: (weight * function(nnx.merge(graphdef, p))).sum())(params)
+
+    ours, our_grads = value_and_grads(lambda both: both.conv.of_images(images, both.norm))
+    plain, plain_grads = value_and_grads(lambda both: both.conv(both.norm(images)))
+    np.testing.assert_allclose(ours, plain, rtol=1e-5)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), our_grads, plain_grads)
+
+
 def test_convolution_is_flax_convolution_with_its_gradients():
     x_NHWC = random(2, 5, 4, 3)
     weight = random(2, 5, 4, 6, seed=1)
