@@ -39,7 +39,7 @@ class Head(nnx.Module):
         features = nnx.relu(self.hidden(hidden.reshape(-1, hidden.shape[-1])))
         kernel = self.kernel[...] if more is None else self.kernel[...] + more
         logits = jnp.dot(features, kernel.astype(self.dtype), preferred_element_type=jnp.float32)
-        return (logits + self.bias[...][None]).reshape(*hidden.shape[:-1], -1)
+        return (logits + self.bias[...][None]).reshape(*hidden.shape[:-1], logits.shape[-1])
 
 
 class PlaceHead(Head):
