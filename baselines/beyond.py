@@ -21,8 +21,10 @@ MUON_LEARNING_RATE = 0.003
 # Of games of two players: there all that follows from a position is certain, and a model can be right to the last game.
 GAMES_LEARNING_RATE = 0.001
 AVERAGE = 0.99  # over a hundred gradient steps or so
-# Where models knew so much of the rewards of steps that they had not learned from, dreams helped or did nothing.
+# Where models knew so much of the rewards of steps that they had not learned from, dreams helped or did nothing. A game
+# of two players pays once, at its end, so that what is wrong there is wrong of a whole game.
 TRUST = 0.5
+GAMES_TRUST = 0.9
 TRUST_WINDOW = 10  # iterations; on Asterix there are some ten rewards in one
 
 # Each part of M6 by name: what it changes of M5.
@@ -39,7 +41,7 @@ PARTS: dict[str, Part] = {
     "games": lambda config: _patient(config) if config.task.startswith(TWO_PLAYERS) else {},
     "average": lambda config: {"world_model.average": AVERAGE},
     "codes": lambda config: _finer_codes(config) if config.task.startswith("craftax") else {},
-    "trust": lambda config: {"imagination.trust": TRUST, "imagination.trust_window": TRUST_WINDOW},
+    "trust": lambda config: {"imagination.trust": _trust(config), "imagination.trust_window": TRUST_WINDOW},
 }
 
 
@@ -80,6 +82,10 @@ def _finer_codes(config: Config) -> dict[str, Any]:
 def _patient(config: Config) -> dict[str, Any]:
     sequences = 2 * config.world_model.sequences
     return {"world_model.learning_rate": GAMES_LEARNING_RATE, "world_model.sequences": sequences}
+
+
+def _trust(config: Config) -> float:
+    return GAMES_TRUST if config.task.startswith(TWO_PLAYERS) else TRUST
 
 
 def _with_parts(config: Config, parts: Mapping[str, Part]) -> Config:

@@ -247,6 +247,12 @@ def test_m6_learns_games_of_two_players_from_more_at_a_lower_rate():
         assert model.sequences == 2 * plain.sequences
 
 
+@pytest.mark.parametrize(("task", "trust"), [("openspiel/bargaining", 0.9), ("minatar/asterix", 0.5)])
+def test_m6_asks_more_of_its_model_in_games_of_two_players(task, trust):
+    assert registry.resolve(task, "m6", "small").imagination.trust == trust
+    assert registry.resolve(task, "m6_no_trust", "small").imagination.trust == 0
+
+
 @pytest.mark.parametrize(("task", "threshold", "size"), [("craftax_full", 0.5, 1024), ("minatar/breakout", 0.75, 512)])
 def test_m6_has_a_finer_codebook_on_craftax_alone(task, threshold, size):
     tokenizer = registry.resolve(task, "m6", "small").tokenizer
