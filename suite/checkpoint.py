@@ -20,6 +20,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from suite.errors import UserError
 from suite.tables import write_whole
@@ -179,10 +180,20 @@ def _restore_tree(path: Path, template: Any) -> Any:
             arguments = ocp.checkpoint_utils.construct_restore_args(wanted)
             found = checkpointer.restore(path.absolute(), args=ocp.args.PyTreeRestore(wanted, restore_args=arguments))
     leaves = [
-        found[name] if (name := jax.tree_util.keystr(key)) in found else jnp.zeros(leaf.shape, leaf.dtype)
+        _unbound(found[name]) if (name := jax.tree_util.keystr(key)) in found else jnp.zeros(leaf.shape, leaf.dtype)
         for key, leaf in flat
     ]
     return jax.tree_util.tree_unflatten(structure, leaves)
+
+
+def _unbound(array: jax.Array) -> jax.Array:
+    """The same array, as free to move between devices as one that was computed: Orbax binds what it reads to a device.
+
+    JAX compiles a program anew for arrays that are bound, so that a run which goes on would compile all of its own.
+    """
+    if jax.dtypes.issubdtype(array.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(jax.device_put(np.asarray(jax.random.key_data(array))))
+    return jax.device_put(np.asarray(array))
 
 
 def _metadata(checkpointer: Any, path: Path) -> dict[str, Any]:

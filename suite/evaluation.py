@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +9,15 @@ import jax
 import numpy as np
 import pandas as pd
 
-from suite import checkpoint, registry
+from suite import registry
 from suite.agent.dyna import Agent
 from suite.agent.rollout import EpisodeLog
-from suite.compilation import enable_compilation_cache
 from suite.config import Config
-from suite.errors import UserError
 from suite.interface.environment import EnvironmentSpec
 from suite.policy.ppo import Learner
 from suite.record import RunRecord
 from suite.reporting import Reporter
+from suite.saved_model import restore
 
 
 def episode_rows(
@@ -77,16 +75,6 @@ def play_episodes(agent: Any, learner: Learner | None, key: jax.Array, episodes:
     return rows
 
 
-def model_of(learner: Learner, tokenizer: Any, world_model_params: Any) -> dict[str, Any]:
-    """What a checkpoint keeps for evaluation and inspection: parameters, value statistics, codebook."""
-    return {
-        "policy": learner.params,
-        "targets": learner.targets,
-        "tokenizer": tokenizer,
-        "world_model": world_model_params,
-    }
-
-
 def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str, Any]:
     """Plays whole episodes with the newest checkpoint of a run folder and appends them to `evaluations.csv`.
 
@@ -102,35 +90,9 @@ def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str
       UserError: not a run folder, another schema, or no usable checkpoint.
     """
     with RunRecord.open(folder) as record:
-        config = record.config
-        agent = agent_for(config, reporter)
-        template = jax.eval_shape(agent.init, jax.random.key(0))
-        restored = checkpoint.restore_latest(folder / "checkpoints", model_template(template))
-        if restored is None:
-            raise UserError(f"{folder} has no checkpoint to evaluate; run it first: suite run {config.task}")
-        for warning in restored.warnings:
-            reporter.warning(warning)
-        learner = Learner(params=restored.model["policy"], optimizer=None, targets=restored.model["targets"])
-        return record_evaluation(record, agent, learner, restored.step, episodes or config.evaluation.episodes)
-
-
-_agents: dict[Config, Agent] = {}  # the last one built
-
-
-def agent_for(config: Config, reporter: Reporter) -> Agent:
-    """The agent of a configuration. Configurations that differ by seed share one, and its compiled programs.
-
-    Those of the agent before are dropped: they would stay for good, and on a CPU each agent's are thousands of memory
-    maps, of which Linux gives a process 65,530. XLA crashes where they end.
-    """
-    unseeded = dataclasses.replace(config, seed=0)
-    if unseeded not in _agents:
-        _agents.clear()
-        jax.clear_caches()
-        enable_compilation_cache()
-        environment = registry.task(config.task).make()(progress=reporter.texture)
-        _agents[unseeded] = Agent(unseeded, environment)
-    return _agents[unseeded]
+        run = restore(record, reporter)
+        episodes = episodes or record.config.evaluation.episodes
+        return record_evaluation(record, run.agent, run.model.learner, run.step, episodes)
 
 
 def record_evaluation(record: RunRecord, agent: Agent, learner: Learner, step: int, episodes: int) -> dict[str, Any]:
@@ -144,9 +106,3 @@ def record_evaluation(record: RunRecord, agent: Agent, learner: Learner, step: i
 def evaluation_key(config: Config, step: int) -> jax.Array:
     """Randomness of the evaluation at a step, apart from training's."""
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), 1), step)
-
-
-def model_template(state: Any) -> dict[str, Any]:
-    """`model_of` a whole `TrainState`, or of its shapes."""
-    model = state.world_model
-    return model_of(state.learner, state.tokenizer, None if model is None else model.params)

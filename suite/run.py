@@ -18,10 +18,10 @@ from suite import checkpoint, registry
 from suite.agent.dyna import Agent, TrainState
 from suite.config import Config
 from suite.errors import RunError, UserError, host_errors
-from suite.evaluation import agent_for, episode_rows, model_of, record_evaluation
-from suite.policy.ppo import Learner
+from suite.evaluation import episode_rows, record_evaluation
 from suite.record import RunRecord, disk_full_is_an_error, run_folder
 from suite.reporting import Reporter
+from suite.saved_model import SavedModel, agent_for
 from suite.world_model.training import WorldModelLearner
 
 PHASES = ("start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint")
@@ -237,7 +237,7 @@ class _Training:
                 signal.signal(number, handler)
 
 
-def _split(state: TrainState) -> tuple[dict[str, Any], dict[str, Any]]:
+def _split(state: TrainState) -> tuple[SavedModel, dict[str, Any]]:
     """A checkpoint's two items: what evaluation needs, and what only going on needs."""
     world_model = state.world_model
     resume = {"optimizer": state.learner.optimizer, "player": state.player, "replay": state.replay}
@@ -247,21 +247,21 @@ def _split(state: TrainState) -> tuple[dict[str, Any], dict[str, Any]]:
         resume["world_model_measured"] = world_model.measured
         if world_model.averaged is not None:
             resume["world_model_trained"] = world_model.params
-    return model_of(state.learner, state.tokenizer, None if world_model is None else world_model.dreaming), resume
+    return SavedModel.of(state), resume
 
 
-def _join(model: dict[str, Any], resume: dict[str, Any]) -> TrainState:
+def _join(model: SavedModel, resume: dict[str, Any]) -> TrainState:
     """The inverse of `_split`."""
     world_model, trained = None, resume["world_model_trained"]
-    if model["world_model"] is not None:
+    if model.world_model is not None:
         world_model = WorldModelLearner(
-            params=model["world_model"] if trained is None else trained,
+            params=model.world_model if trained is None else trained,
             optimizer=resume["world_model_optimizer"],
-            averaged=None if trained is None else model["world_model"],
+            averaged=None if trained is None else model.world_model,
             measured=resume["world_model_measured"],
         )
-    learner = Learner(params=model["policy"], optimizer=resume["optimizer"], targets=model["targets"])
-    return TrainState(learner, resume["player"], resume["replay"], model["tokenizer"], world_model)
+    learner = dataclasses.replace(model.learner, optimizer=resume["optimizer"])
+    return TrainState(learner, resume["player"], resume["replay"], model.tokenizer, world_model)
 
 
 def _result(record: RunRecord, status: str) -> Result:

@@ -152,7 +152,7 @@ def test_a_run_folder_in_use(suite, folder):
 
 
 def test_evaluating_without_a_checkpoint(suite, folder):
-    refused(suite("evaluate", folder, "--quiet"), "has no checkpoint to evaluate")
+    refused(suite("evaluate", folder, "--quiet"), "has no checkpoint")
 
 
 # What is printed.

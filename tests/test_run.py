@@ -13,10 +13,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from suite import checkpoint, evaluation, registry, run
+from suite import evaluation, registry, run
+from suite.agent.dyna import Agent
 from suite.errors import RunError, UserError
+from suite.record import RunRecord
 from suite.reporting import QuietReporter
+from suite.saved_model import restore
 from tests.tiny import CORRIDOR, PENNIES
+
+# Programs run for a moment here; whether a run that goes on is the same one does not depend on how well they run.
+pytestmark = pytest.mark.usefixtures("hasty_compilation")
 
 
 @pytest.fixture(autouse=True)
@@ -65,11 +71,8 @@ def files(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in names}
 
 
-def last_model(folder: Path, settings):
-    agent = evaluation.agent_for(settings, QuietReporter())
-    template = evaluation.model_template(jax.eval_shape(agent.init, jax.random.key(0)))
-    restored = checkpoint.restore_latest(folder / "checkpoints", template)
-    return [np.asarray(x) for x in jax.tree.leaves(restored.model)]
+def last_model(folder: Path):
+    return [np.asarray(x) for x in jax.tree.leaves(restore(RunRecord.open(folder, lock=False), QuietReporter()).model)]
 
 
 @pytest.fixture(scope="module")
@@ -84,10 +87,17 @@ def uninterrupted(tmp_path_factory):
 def assert_same(result, uninterrupted):
     assert result.status == "finished"
     assert files(result.folder) == files(uninterrupted.folder)
-    mine_and_theirs = (last_model(run.folder, config()) for run in (result, uninterrupted))
+    mine_and_theirs = (last_model(run.folder) for run in (result, uninterrupted))
     for mine, theirs in zip(*mine_and_theirs, strict=True):
         np.testing.assert_array_equal(mine, theirs)
     assert result.scores == uninterrupted.scores
+
+
+def programs() -> list[int]:
+    """How many programs each phase has."""
+    phases = (Agent.start, Agent.collect, Agent.remember, Agent.learn)
+    phases += (Agent.update_tokenizer, Agent.update_world_model, Agent.imagine)
+    return [phase._cache_size() for phase in phases]
 
 
 @pytest.mark.parametrize(("phase", "times"), [("collect", 3), ("imagine", 2)])
@@ -95,7 +105,9 @@ def test_a_stopped_and_resumed_run_is_an_uninterrupted_one(tmp_path, uninterrupt
     stopped = run.run(config(), tmp_path, StopAt(phase, times))
     assert stopped.status == "stopped"
     assert 0 < stopped.steps < config().total_steps
+    before = programs()
     assert_same(run.run(config(), tmp_path, QuietReporter(), resume=True), uninterrupted)
+    assert programs() == before  # what was read from disk is to JAX what was computed: it compiles nothing anew
 
 
 PHASES = ["start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint", "evaluate"]
@@ -169,6 +181,21 @@ def test_evaluations_beside_training_leave_it_as_it_is(tmp_path, uninterrupted):
     assert rounds[0] != rounds[1]  # randomness of their own
 
 
+def test_a_broken_checkpoint_gives_way_to_the_one_before(tmp_path, uninterrupted):
+    with pytest.raises(Killed):
+        run.run(config(), tmp_path, KillAt("collect", 6))
+    folder = next(tmp_path.glob("*/*/*/seed_0"))
+    newest = max((folder / "checkpoints").glob("step_*"))
+    file = max((newest / "resume").rglob("*"), key=lambda path: path.stat().st_size if path.is_file() else 0)
+    file.write_bytes(file.read_bytes()[:-1])
+    warned = []
+    reporter = QuietReporter()
+    reporter.warning = warned.append
+    assert_same(run.run(config(), tmp_path, reporter), uninterrupted)
+    assert len(warned) == 1
+    assert "damaged" in warned[0]
+
+
 def test_without_a_world_model_nothing_of_it_exists(tmp_path):
     result = run.run(config("mfrl"), tmp_path, QuietReporter())
     columns = pd.read_csv(result.folder / "metrics.csv").columns
@@ -190,21 +217,6 @@ def test_a_diverged_loss_stops_the_run_and_says_where(tmp_path):
     settings = config("mfrl", "ppo.learning_rate=1e30", "ppo.max_grad_norm=1e30")
     with pytest.raises(RunError, match=r"learn/.* became .* in phase learn at step \d+"):
         run.run(settings, tmp_path, QuietReporter())
-
-
-def test_a_broken_checkpoint_gives_way_to_the_one_before(tmp_path, uninterrupted):
-    with pytest.raises(Killed):
-        run.run(config(), tmp_path, KillAt("collect", 6))
-    folder = next(tmp_path.glob("*/*/*/seed_0"))
-    newest = max((folder / "checkpoints").glob("step_*"))
-    file = max((newest / "resume").rglob("*"), key=lambda path: path.stat().st_size if path.is_file() else 0)
-    file.write_bytes(file.read_bytes()[:-1])
-    warned = []
-    reporter = QuietReporter()
-    reporter.warning = warned.append
-    assert_same(run.run(config(), tmp_path, reporter), uninterrupted)
-    assert len(warned) == 1
-    assert "damaged" in warned[0]
 
 
 def test_resume_without_a_run_is_an_error(tmp_path):

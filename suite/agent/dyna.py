@@ -23,7 +23,7 @@ from suite.interface.batching import Batched
 from suite.interface.environment import BatchedEnvironment, Environment, EnvironmentSpec, State
 from suite.interface.host import HostEnvironment
 from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec, encode_frame
-from suite.interface.turns import stream_action
+from suite.interface.turns import Turn, stream_action
 from suite.policy import ppo
 from suite.policy.actor_critic import make_policy
 from suite.tokenizers import make_tokenizer
@@ -379,16 +379,38 @@ class Agent:
             game = Batched(self.batched.environment, plan.num_envs)
             return game.resumed(start.state, start.observation, start.first, start.turn)
         before = jax.tree.map(lambda x: x[len(past.first) - 1 - self.past : -1], past)
+        known = Past(before.observation, before.action, before.turn) if self.past else None
+        return self.dream_from(model, tokenizer, start.observation, start.turn, plan.horizon, known)
+
+    def dream_from(
+        self,
+        model: WorldModel,
+        tokenizer: TokenizerState,
+        observation_BO: jax.Array,
+        turn_B: Turn | None,
+        horizon: int,
+        past: Past | None = None,
+    ) -> Dream:
+        """The world model as an environment that starts at these frames (Algorithm 4).
+
+        Args:
+          model, tokenizer: the world model with its parameters, and its tokenizer's state.
+          observation_BO: the frames.
+          turn_B: whose turn it is there, in a game of two players.
+          horizon: steps that it can take.
+          past: the `self.past` real frames before these, if there are some to be told of.
+        """
+        plan = self.config.imagination
         return Dream(
             model,
             self.tokenizer,
             tokenizer,
             self.spec,
             self.tokens,
-            plan.horizon,
-            start.observation,
-            start.turn,
-            past=Past(before.observation, before.action, before.turn) if self.past else None,
+            horizon,
+            observation_BO,
+            turn_B,
+            past=past,
             context=plan.context,
             min_p=plan.min_p,
         )

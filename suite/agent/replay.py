@@ -79,7 +79,8 @@ class Replay:
             turn=_no_turn(spec) if spec.two_player else None,
             state=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state),
         )
-        return self._buffer(1, 1).init(step)
+        # flashbax counts with Python's numbers, whose weak types a restored buffer does not have: another program each.
+        return jax.tree.map(lambda x: x.astype(x.dtype), self._buffer(1, 1).init(step))
 
     def add(self, state: ReplayState, trajectory: Trajectory) -> ReplayState:
         """Appends a trajectory (time-major, [T, B]); the oldest steps give way."""

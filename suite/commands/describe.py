@@ -19,7 +19,7 @@ def execute(args: argparse.Namespace) -> int:
     layers = registry.layers(args.task, args.agent, args.preset, args.overrides, 0, args.steps)
 
     from suite.describe import describe
-    from suite.evaluation import agent_for
+    from suite.saved_model import agent_for
 
     config, state = layers[-1][1], None
     if config.imagination.world == "game":  # only then is the game itself looked at

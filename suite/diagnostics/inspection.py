@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,26 +11,16 @@ import jax
 import pandas as pd
 
 from suite import checkpoint
-from suite.agent.dyna import Agent
 from suite.diagnostics import evaluation_set, filmstrips, pictures, symbols
 from suite.diagnostics.evaluation_set import EvaluationSet
 from suite.diagnostics.rollouts import Rollouts, compare, imagine
 from suite.errors import UserError
-from suite.evaluation import agent_for, model_template
 from suite.record import RunRecord, require_writable
 from suite.reporting import Reporter
+from suite.saved_model import no_checkpoint, restore
 from suite.tables import write_whole
 
 STRIPS = 4
-
-
-@dataclasses.dataclass(frozen=True)
-class Restored:
-    """A run's agent and the newest checkpoint's model, taken after so many real steps."""
-
-    agent: Agent
-    model: dict[str, Any]
-    step: int
 
 
 def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> dict[str, Any]:
@@ -70,7 +59,7 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
     rows, steps, codes = {}, {}, {}
     for record, run, name in zip(records, runs, _names(records), strict=True):
         reporter.message(f"imagining {len(real.action)} rollouts of {name}")
-        world_model, tokenizer = run.model["world_model"], run.model["tokenizer"]
+        world_model, tokenizer = run.model.world_model, run.model.tokenizer
         found[name] = imagine(run.agent, world_model, tokenizer, whole, jax.random.key(0), start)
         high = spec.observation.high
         table, summary = compare(real, found[name], run.agent.tokens, high, extractor)
@@ -97,22 +86,6 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
     return {"folder": str(out), "runs": rows}
 
 
-def restore(record: RunRecord, reporter: Reporter) -> Restored:
-    """The newest checkpoint of a run.
-
-    Raises:
-      UserError: it has none.
-    """
-    agent = agent_for(record.config, reporter)
-    template = jax.eval_shape(agent.init, jax.random.key(0))
-    restored = checkpoint.restore_latest(record.folder / "checkpoints", model_template(template))
-    if restored is None:
-        raise UserError(_no_checkpoint(record))
-    for warning in restored.warnings:
-        reporter.warning(warning)
-    return Restored(agent, restored.model, restored.step)
-
-
 def _check(records: Sequence[RunRecord]) -> None:
     first = records[0]
     for record in records:
@@ -126,15 +99,11 @@ def _check(records: Sequence[RunRecord]) -> None:
             if ours != theirs:
                 raise UserError(f"{record.folder} is of {field} {ours}, {first.folder} of {theirs}: inspect them apart")
         if checkpoint.latest_step(record.folder / "checkpoints") is None:
-            raise UserError(_no_checkpoint(record))
+            raise no_checkpoint(record)
     folders = [record.folder.resolve() for record in records]
     for i, folder in enumerate(folders):
         if folder in folders[:i]:
             raise UserError(f"{records[i].folder} is named twice")
-
-
-def _no_checkpoint(record: RunRecord) -> str:
-    return f"{record.folder} has no checkpoint to inspect; run it first: suite run {record.config.task}"
 
 
 def _names(records: Sequence[RunRecord]) -> list[str]:

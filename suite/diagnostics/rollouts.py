@@ -21,7 +21,7 @@ from suite.agent.dyna import Agent
 from suite.diagnostics.evaluation_set import EvaluationSet
 from suite.interface.tokens import TokenizerState, TokenSpec
 from suite.world_model.ages import ages_of
-from suite.world_model.imagination import Dream, Past
+from suite.world_model.imagination import Past
 
 CHUNK = 32  # trajectories imagined together
 BINS = 10  # of probabilities, for calibration
@@ -113,21 +113,11 @@ def _imagine(
 
     Of the frames and actions the first are those that the agent's dreams know besides; nothing is returned of them.
     """
-    plan, model = agent.config.imagination, nnx.merge(agent.world_model_graph, world_model)
+    model = nnx.merge(agent.world_model_graph, world_model)
+    context = agent.config.imagination.context
     past, horizon = agent.past, action_NT.shape[1] - agent.past
     known = Past(jnp.swapaxes(frames_NTO[:, :past], 0, 1), action_NT[:, :past].T) if past else None
-    dream = Dream(
-        model,
-        agent.tokenizer,
-        tokenizer,
-        agent.spec,
-        agent.tokens,
-        horizon,
-        frames_NTO[:, past],
-        past=known,
-        context=plan.context,
-        min_p=plan.min_p,
-    )
+    dream = agent.dream_from(model, tokenizer, frames_NTO[:, past], None, horizon, known)
     start, _ = dream.reset(key)
 
     def step(state: Any, inputs: Any) -> Any:
@@ -137,9 +127,9 @@ def _imagine(
 
     _, imagined = jax.lax.scan(step, start, (jax.random.split(key, horizon), action_NT[:, past:].T))
     tokens_NTL = agent.tokenizer.encode(tokenizer, frames_NTO)
-    read = slice(past - plan.context, -1)
+    read = slice(past - context, -1)
     age_NTL = ages_of(tokens_NTL, agent.ages)[:, read] if agent.ages else None
-    hidden = model(tokens_NTL[:, read], action_NT[:, past - plan.context :], age_BTL=age_NTL)[:, plan.context :]
+    hidden = model(tokens_NTL[:, read], action_NT[:, past - context :], age_BTL=age_NTL)[:, context:]
     tokens_NTL = tokens_NTL[:, past:]
     copied_NT = jnp.zeros(hidden.shape[:2])
     if model.gate_head is not None:

@@ -15,18 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx, struct
 
-from suite import checkpoint
 from suite.agent import rollout as play
 from suite.agent.dyna import Agent
 from suite.errors import UserError
-from suite.evaluation import agent_for, model_template
 from suite.interface.environment import State, TimeStep
 from suite.interface.turns import CHANCE, Turn
 from suite.policy.actor_critic import UniformPolicy
 from suite.policy.ppo import Learner
 from suite.record import RunRecord
 from suite.reporting import QuietReporter, Reporter
-from suite.world_model.imagination import Dream
+from suite.saved_model import restore
 
 GAMES = 1_000
 
@@ -192,17 +190,7 @@ def _go_on(
     """One dream, from where the imagined games are, and what the real ones make of its events."""
     policy, model = _policy(agent, learner, uniform), nnx.merge(agent.world_model_graph, world_model)
     start, horizon = games.imagined, agent.config.imagination.horizon
-    dream = Dream(
-        model,
-        agent.tokenizer,
-        tokenizer,
-        agent.spec,
-        agent.tokens,
-        horizon,
-        start.observation,
-        start.turn,
-        min_p=agent.config.imagination.min_p,
-    )
+    dream = agent.dream_from(model, tokenizer, start.observation, start.turn, horizon)
     player = play.start(policy, dream, key, burn_in=0)
     time_step = dataclasses.replace(player.time_step, first=start.first)
     player = dataclasses.replace(player, time_step=time_step, hidden_BH=games.hidden_BH)
@@ -264,17 +252,11 @@ def rules_of_run(folder: Path, games: int = GAMES, reporter: Reporter | None = N
     """
     reporter = reporter or QuietReporter()
     record = RunRecord.open(folder, lock=False)
-    config = record.config
-    if not (config.world_model.enabled and record.spec.two_player):
+    if not (record.config.world_model.enabled and record.spec.two_player):
         raise UserError(f"{folder} has no world model of a two-player game")
-    agent = agent_for(config, reporter)
-    template = jax.eval_shape(agent.init, jax.random.key(0))
-    restored = checkpoint.restore_latest(folder / "checkpoints", model_template(template))
-    if restored is None:
-        raise UserError(f"{folder} has no checkpoint")
-    model = restored.model
-    learner = Learner(params=model["policy"], optimizer=None, targets=model["targets"])
-    play_as = functools.partial(rules_kept, agent, learner, model["world_model"], model["tokenizer"])
+    saved = restore(record, reporter)
+    model = saved.model
+    play_as = functools.partial(rules_kept, saved.agent, model.learner, model.world_model, model.tokenizer)
     found = {}
     for name in ("agent", "uniform"):
         reporter.message(f"imagining {games} games, {name} play")

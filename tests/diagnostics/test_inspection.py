@@ -17,10 +17,10 @@ from suite.agent.dyna import Agent
 from suite.diagnostics import evaluation_set, inspection, rollouts, symbols
 from suite.diagnostics.evaluation_set import Pairs, WithSymbols
 from suite.errors import UserError
-from suite.evaluation import agent_for, model_template
 from suite.record import RunRecord, run_folder
 from suite.registry import Lazy
 from suite.reporting import QuietReporter
+from suite.saved_model import SavedModel, agent_for, restore
 from suite.world_model.ages import ages_of
 from tests.tiny import CORRIDOR, PENNIES, Corridor
 
@@ -75,7 +75,7 @@ def untrained(out, task, agent):
         tokenizer = dataclasses.replace(tokenizer, codes_KP=codes_KP, count=jnp.int32(2))
         with RunRecord.open(folder) as record:
             record.append_metrics({"step": 32, "tokenizer/codes": 2.0})
-    model = model_template(dataclasses.replace(state, tokenizer=tokenizer))
+    model = SavedModel.of(dataclasses.replace(state, tokenizer=tokenizer))
     checkpoint.save(folder / "checkpoints", 32, model, {}, {})
     return folder
 
@@ -190,8 +190,8 @@ def test_a_model_that_knows_what_came_before(tmp_path):
     assert steps.step.m5.tolist() == steps.step.m6.tolist() == [1, 2, 3, 4]
     assert steps.repeated_error.m5.tolist() == steps.repeated_error.m6.tolist()
 
-    run = inspection.restore(RunRecord.open(folders[1], lock=False), QUIET)
-    model, tokenizer = run.model["world_model"], run.model["tokenizer"]
+    run = restore(RunRecord.open(folders[1], lock=False), QUIET)
+    model, tokenizer = run.model.world_model, run.model.tokenizer
     real, past = evaluation_set.load("unknown", "smoke", QUIET), run.agent.past
     found = rollouts.imagine(run.agent, model, tokenizer, real, jax.random.key(0), start=past)
     tokens_NTL = run.agent.tokenizer.encode(tokenizer, real.frames)
@@ -208,7 +208,7 @@ def test_a_model_that_knows_what_came_before(tmp_path):
 def test_what_cannot_be_inspected(runs, tmp_path):
     for folders, message in (
         ([begun(tmp_path, "corridor", "mfrl")], "has no world model: mfrl learns from real play only"),
-        ([begun(tmp_path, "corridor", "m5")], "has no checkpoint to inspect; run it first: suite run corridor"),
+        ([begun(tmp_path, "corridor", "m5")], "has no checkpoint; run it first: suite run corridor"),
         ([runs[0], begun(tmp_path, "unknown", "m5")], "is of task unknown, .* of corridor: inspect them apart"),
         ([begun(tmp_path, "pennies", "m5"), runs[0]], "is a run of a two-player game: inspect it apart"),
         ([runs[0], runs[0]], "is named twice"),
