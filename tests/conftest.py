@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # pages of harmless notes on a warm compilation cache
@@ -32,6 +33,20 @@ def drop_compiled_programs():
     jax.clear_caches()
 
 
+# Tests of these run small programs for a moment, so that compiling them is most of the time. What is compiled as for
+# users is tested by the rest: games, whole commands in processes of their own, the page.
+HASTY = ("agent", "baselines", "diagnostics", "interface", "policy", "tokenizers", "world_model", "test_run.py")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def hasty_compilation(request):
+    """Compiles the programs of a module below `HASTY` without most optimizations, in half of the time."""
+    hasty = request.path.relative_to(Path(__file__).parent).parts[0] in HASTY
+    jax.config.update("jax_disable_most_optimizations", hasty)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture
 def suite(capsys):
     """Runs a command: its exit code, stdout and stderr."""
@@ -43,11 +58,3 @@ def suite(capsys):
         return code, *capsys.readouterr()
 
     return command
-
-
-@pytest.fixture(scope="module")
-def hasty_compilation():
-    """For programs that run for a moment: the whole module's are compiled without most optimisations."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)

@@ -21,9 +21,6 @@ from suite.reporting import QuietReporter
 from suite.saved_model import restore
 from tests.tiny import CORRIDOR, PENNIES
 
-# Programs run for a moment here; whether a run that goes on is the same one does not depend on how well they run.
-pytestmark = pytest.mark.usefixtures("hasty_compilation")
-
 
 @pytest.fixture(autouse=True)
 def corridor(monkeypatch):

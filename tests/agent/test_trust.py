@@ -48,7 +48,7 @@ def test_the_window_needs_trust():
         registry.resolve("minatar/breakout", "m5", "small", ["imagination.trust_window=10"])
 
 
-def test_the_newest_steps_measure_a_model_that_has_not_learned_from_them(monkeypatch, hasty_compilation):
+def test_the_newest_steps_measure_a_model_that_has_not_learned_from_them(monkeypatch):
     """The buffer holds two iterations: no step of the first one pays, every step of the second one does."""
     monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
     changes = ["imagination.trust=0.7", "imagination.trust_window=2", "world_model.patch_contents=true"]

@@ -9,9 +9,6 @@ from suite import registry, run
 from suite.reporting import QuietReporter
 from tests.tiny import WIDE_CORRIDOR
 
-# Twenty agents are compiled here to run for a moment each.
-pytestmark = pytest.mark.usefixtures("hasty_compilation")
-
 # What m6 lacks without one of its parts, m5 lacks too; test_presets says which settings those are.
 AGENTS = sorted(agent for agent in registry.agents() if not agent.startswith("m6_no_"))
 RUNGS = ("m1", "m3", "m5")  # m2 and m4 differ from these in what the tiny task shows as well

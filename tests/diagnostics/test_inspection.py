@@ -38,13 +38,6 @@ UNKNOWN = dataclasses.replace(CORRIDOR, id="unknown", family="unknown")
 
 
 @pytest.fixture(autouse=True, scope="module")
-def hasty_compilation():
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
-
-
-@pytest.fixture(autouse=True, scope="module")
 def tasks(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(registry, "TASKS", (KNOWN, UNKNOWN, PENNIES))
