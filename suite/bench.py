@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from suite import registry
+from suite.agent.algorithm import iterate, iteration_key, start_key
 from suite.agent.dyna import Agent
 from suite.compilation import enable_compilation_cache
 from suite.config import Config
@@ -74,30 +75,33 @@ def matmul_rate(compute_type: str) -> float:
 def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: Reporter) -> Table:
     """One row per phase of an iteration after warmup: time, share, and what it achieves.
 
-    `agent` has few model updates; their time is scaled to `config`'s.
+    `agent` has few model updates, and one imagined one is measured; their time is scaled to `config`'s.
     """
-    keys = jax.random.split(jax.random.key(0), 8)
-    state = agent.init(keys[0])
     rows: Table = []
+    scales = {
+        "tokenizer": config.tokenizer.updates / max(1, agent.config.tokenizer.updates),
+        "world_model": config.world_model.updates / max(1, agent.config.world_model.updates),
+        "imagine": config.imagination.updates,
+    }
 
-    def measure(
-        phase: str, function: Callable[..., Any], donated: Any, arguments: tuple[Any, ...], times: float, kind: str
-    ) -> Any:
-        """Times `function(donated, *arguments)`, whose first result replaces what it was given."""
+    def measure(phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Times a phase of Algorithm 1. The first of its results takes the place of the argument that is donated."""
         reporter.message(f"measuring {phase}")
-        flops = count_flops(function, donated, *arguments)
-        holder = [jax.block_until_ready(function(donated, *arguments))]
+        flops = count_flops(function, *arguments)
+        donated = 1 if phase == "collect" else 0
+        holder = [jax.block_until_ready(function(*arguments))]
 
         def call() -> Any:
             previous = holder[0][0] if isinstance(holder[0], tuple) else holder[0]
-            holder[0] = function(previous, *arguments)
+            holder[0] = function(*arguments[:donated], previous, *arguments[donated + 1 :])
             return holder[0]
 
         seconds = seconds_of(call)
+        kind = (config.world_model if phase in ("tokenizer", "world_model") else config.policy).compute_type
         rows.append(
             {
                 "phase": phase,
-                "ms": 1e3 * seconds * times,
+                "ms": 1e3 * seconds * scales.get(phase, 1),
                 "share %": 0.0,
                 "GFLOP/s": flops / seconds / 1e9,
                 "% of matmul": 100 * flops / seconds / peak[kind],
@@ -105,31 +109,8 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
         )
         return holder[0]
 
-    policy_type, model_type = config.policy.compute_type, config.world_model.compute_type
-
-    def collect(player: Any, key: jax.Array) -> Any:
-        return agent.collect(state.learner.acting, player, key)
-
-    _, trajectory, _ = measure("collect", collect, state.player, (keys[1],), 1, policy_type)
-    learner, replay = state.learner, state.replay
-    if replay is not None:
-        replay = measure("remember", agent.remember, replay, (trajectory,), 1, policy_type)
-    if config.ppo.learn_from_real:
-        learner, _ = measure("learn", agent.learn, learner, (trajectory, jnp.zeros(2, jnp.float32)), 1, policy_type)
-    world_model, tokenizer = None, None
-    if config.world_model.enabled:
-        scale = config.tokenizer.updates / max(1, agent.config.tokenizer.updates)
-        arguments: tuple[Any, ...] = (replay, keys[2])
-        tokenizer, _ = measure("tokenizer", agent.update_tokenizer, state.tokenizer, arguments, scale, model_type)
-        scale = config.world_model.updates / max(1, agent.config.world_model.updates)
-        arguments = (tokenizer, replay, keys[3])
-        world_model, _ = measure(
-            "world_model", agent.update_world_model, state.world_model, arguments, scale, model_type
-        )
-    if config.dreams:
-        one = jnp.ones((), jnp.int32)
-        arguments = (None if world_model is None else world_model.dreaming, tokenizer, replay, keys[4], one)
-        measure("imagine", agent.imagine, learner, arguments, config.imagination.updates, policy_type)
+    state = agent.init(start_key(config.seed))
+    iterate(agent, state, iteration_key(config.seed, 0), 0, measure, lambda *_: 1 if config.dreams else 0)
     total = sum(row["ms"] for row in rows)
     for row in rows:
         row["share %"] = 100 * row["ms"] / total

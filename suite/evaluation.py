@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 
 from suite import registry
+from suite.agent.algorithm import evaluation_key
 from suite.agent.dyna import Agent
 from suite.agent.rollout import EpisodeLog
-from suite.config import Config
 from suite.interface.environment import EnvironmentSpec
 from suite.policy.ppo import Learner
 from suite.record import RunRecord
@@ -97,12 +97,7 @@ def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str
 
 def record_evaluation(record: RunRecord, agent: Agent, learner: Learner, step: int, episodes: int) -> dict[str, Any]:
     """Plays whole episodes with the policy of `step`, records them, and returns their scores."""
-    rows = play_episodes(agent, learner, evaluation_key(record.config, step), episodes)
+    rows = play_episodes(agent, learner, evaluation_key(record.config.seed, step), episodes)
     record.append_evaluation({**row, "step": step} for row in rows)
     scores = registry.task(record.config.task).scores()(pd.DataFrame(rows), None, agent.spec)
     return {"step": step, "episodes": len(rows), **scores}
-
-
-def evaluation_key(config: Config, step: int) -> jax.Array:
-    """Randomness of the evaluation at a step, apart from training's."""
-    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), 1), step)

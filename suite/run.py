@@ -6,15 +6,15 @@ import contextlib
 import dataclasses
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from suite import checkpoint, registry
+from suite.agent.algorithm import iterate, iteration_key, start_key
 from suite.agent.dyna import Agent, TrainState
 from suite.config import Config
 from suite.errors import RunError, UserError, host_errors
@@ -67,8 +67,9 @@ class _Training:
     def __init__(self, config: Config, agent: Agent, record: RunRecord, reporter: Reporter):
         self.config, self.agent, self.record, self.reporter = config, agent, record, reporter
         self.checkpoints = record.folder / "checkpoints"
-        self.key = jax.random.key(self.config.seed)
         self.iteration = self.steps = 0
+        self.found: dict[str, Any] = {}  # the present iteration's metrics
+        self.rows: list[dict[str, Any]] = []  # and the episodes that ended in it
         self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
         self.recorded_seconds: dict[str, float] = {}  # of those, what timing.csv has
         self.stop_requested = False
@@ -111,12 +112,12 @@ class _Training:
         return bool(every) and self.steps // every > before // every
 
     def _restore(self) -> TrainState:
-        init_key = jax.random.fold_in(self.key, 0)
-        template = jax.eval_shape(self.agent.init, init_key)
+        key = start_key(self.config.seed)
+        template = jax.eval_shape(self.agent.init, key)
         restored = checkpoint.restore_latest(self.checkpoints, *_split(template))
         if restored is None:
             self.record.rewind(0)
-            return self.agent.init(init_key)
+            return self.agent.init(key)
         for warning in restored.warnings:
             self.reporter.warning(warning)
         self.iteration, self.steps = restored.host["iteration"], restored.host["steps"]
@@ -127,49 +128,37 @@ class _Training:
         return _join(restored.model, restored.resume)
 
     def _iterate(self, state: TrainState) -> TrainState:
-        """One iteration of Algorithm 1. Randomness depends only on the seed and the iteration."""
-        agent, config = self.agent, self.config
-        metrics: dict[str, float] = {}
-        keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(self.key, 2), self.iteration), 4)
-        learner, player, replay = state.learner, state.player, state.replay
-        tokenizer, world_model = state.tokenizer, state.world_model
-        with self._phase("collect"):
-            player, trajectory, log = agent.collect(learner.acting, player, keys[0])
-            if replay is not None:
-                replay = agent.remember(replay, trajectory)
-            log = jax.device_get(log)
-            reward = float(trajectory.reward_TB.mean())
-            rows, taken = episode_rows(log, agent.spec, log.ended_TB, self.steps)
-        before = self.steps
-        self.iteration, self.steps = self.iteration + 1, self.steps + taken
-        if config.ppo.learn_from_real and config.policy.kind != "uniform":
-            with self._phase("learn"):
-                learner, found = agent.learn(learner, trajectory, jnp.array([before, self.steps], jnp.float32))
-                metrics |= self._check("learn", found)
-        del trajectory
-        if world_model is not None:
-            with self._phase("tokenizer"):
-                tokenizer, found = agent.update_tokenizer(tokenizer, replay, keys[1])
-                metrics |= self._check("tokenizer", found)
-            with self._phase("world_model"):
-                world_model, found = agent.update_world_model(world_model, tokenizer, replay, keys[2])
-                metrics |= self._check("world_model", found)
-        updates = config.imagined_updates(self.steps, metrics.get("world_model/reward_known"))
-        if updates:
-            params = None if world_model is None else world_model.dreaming
-            with self._phase("imagine"):
-                learner, found = agent.imagine(
-                    learner, params, tokenizer, replay, keys[3], jnp.asarray(updates, jnp.int32)
-                )
-                metrics |= self._check("imagine", found)
-        self.record.append_episodes(rows)
-        returns = [row["return"] for row in rows]
+        """One iteration of Algorithm 1, and what it leaves in the record."""
+        self.found, self.rows = {}, []
+        key = iteration_key(self.config.seed, self.iteration)
+        self.iteration += 1
+        state, _ = iterate(self.agent, state, key, self.steps, self._call)
+        self.record.append_episodes(self.rows)
+        returns = [row["return"] for row in self.rows]
         mean_return = float(np.mean(returns)) if returns else None
-        summary = {"reward_per_step": reward, "episodes": len(rows), "return": mean_return}
-        self.record.append_metrics({"step": self.steps, **summary, **metrics}, agent.metric_names)
+        summary = {"reward_per_step": self.found.pop("reward_per_step"), "episodes": len(returns)}
+        row = {"step": self.steps, **summary, "return": mean_return, **self.found}
+        self.record.append_metrics(row, self.agent.metric_names)
         self._record_timing()
         self.reporter.update(self.steps, "", {} if mean_return is None else {"return": mean_return})
-        return TrainState(learner, player, replay, tokenizer, world_model)
+        return state
+
+    def _call(self, phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Runs and times a phase; keeps its metrics and, of real play, the episodes."""
+        if phase == "remember":  # the end of collecting, and nothing to wait for
+            with self._timed("collect"):
+                return function(*arguments)
+        with self._phase(phase):
+            result = function(*arguments)
+            if phase == "collect":
+                _, trajectory, log = result
+                log = jax.device_get(log)
+                self.rows, taken = episode_rows(log, self.agent.spec, log.ended_TB, self.steps)
+                self.steps += taken
+                self.found["reward_per_step"] = float(trajectory.reward_TB.mean())
+            else:
+                self.found |= self._check(phase, result[1])
+        return result
 
     def _record_timing(self) -> None:
         """Seconds per phase since the last iteration's row; the first compiles."""
@@ -180,6 +169,11 @@ class _Training:
     @contextlib.contextmanager
     def _phase(self, name: str) -> Iterator[None]:
         self.reporter.update(self.steps, name, {})
+        with self._timed(name):
+            yield
+
+    @contextlib.contextmanager
+    def _timed(self, name: str) -> Iterator[None]:
         start = time.monotonic()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start

@@ -35,7 +35,17 @@ def drop_compiled_programs():
 
 # Tests of these run small programs for a moment, so that compiling them is most of the time. What is compiled as for
 # users is tested by the rest: games, whole commands in processes of their own, the page.
-HASTY = ("agent", "baselines", "diagnostics", "interface", "policy", "tokenizers", "world_model", "test_run.py")
+HASTY = (
+    "agent",
+    "baselines",
+    "diagnostics",
+    "interface",
+    "policy",
+    "tokenizers",
+    "world_model",
+    "test_bench.py",
+    "test_run.py",
+)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -1,7 +1,8 @@
-"""Algorithm 1: an agent that learns from real and imagined play. All the wiring, in one file.
+"""The agent of Algorithm 1, which learns from real and imagined play: its parts, and each phase of an iteration.
 
 Each phase is one compiled function over donated state, with its loop inside; only metrics return to the host. The
-state is one pytree of arrays, so that several seeds can become its leading axis. `suite.run` calls the phases.
+state is one pytree of arrays, so that several seeds can become its leading axis. `suite.agent.algorithm` runs
+the phases in their order.
 """
 
 from __future__ import annotations

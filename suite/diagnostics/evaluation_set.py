@@ -6,6 +6,7 @@ Built once per task, preset and package version, and kept in the user's cache fo
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.metadata
 import io
 from collections.abc import Callable
@@ -13,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from suite import registry
+from suite.agent.algorithm import iterate, iteration_key, start_key
 from suite.agent.dyna import Agent
 from suite.cache import cache_dir
 from suite.compilation import enable_compilation_cache
@@ -180,24 +181,26 @@ def collect(agent: Agent, pairs: int, reporter: Reporter) -> tuple[EvaluationSet
     kept: list[dict[str, np.ndarray]] = []
     shown: list[dict[str, np.ndarray]] = []
 
-    key = jax.random.key(config.seed)
-    state = agent.init(jax.random.fold_in(key, 0))
-    learner, player, taken = state.learner, state.player, 0
-    del state
+    def keep(iteration: int, phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Runs a phase of Algorithm 1; of real play it keeps what is wanted."""
+        result = function(*arguments)
+        if phase == "collect":
+            player, trajectory, log = result
+            arrays = _arrays(jax.device_get((trajectory, player.time_step.observation, log)))
+            here = np.sort(drawn[drawn // envs == iteration] % envs)
+            for env in here:
+                start = random.integers(length - steps + 1)
+                cut = {name: array[start : start + steps, env] for name, array in arrays.items() if name != "frames"}
+                kept.append(cut | {"frames": arrays["frames"][start : start + steps + 1, env]})
+            wanted = pairs * (iteration + 1) // iterations - sum(len(part["symbols"]) for part in shown)
+            shown.append(_pairs(random, arrays, np.setdiff1d(np.arange(envs), here), wanted, validation_B))
+        return result
+
+    state, taken = agent.init(start_key(config.seed)), 0
     reporter.start(config.total_steps, 0)
     for iteration in range(iterations):
-        collect_key, *_ = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, 2), iteration), 4)
-        player, trajectory, log = agent.collect(learner.acting, player, collect_key)
-        before, taken = taken, taken + config.steps_per_iteration
-        arrays = _arrays(jax.device_get((trajectory, player.time_step.observation, log)))
-        here = np.sort(drawn[drawn // envs == iteration] % envs)
-        for env in here:
-            start = random.integers(length - steps + 1)
-            cut = {name: array[start : start + steps, env] for name, array in arrays.items() if name != "frames"}
-            kept.append(cut | {"frames": arrays["frames"][start : start + steps + 1, env]})
-        wanted = pairs * (iteration + 1) // iterations - sum(len(part["symbols"]) for part in shown)
-        shown.append(_pairs(random, arrays, np.setdiff1d(np.arange(envs), here), wanted, validation_B))
-        learner, _ = agent.learn(learner, trajectory, jnp.array([before, taken], jnp.float32))
+        key = iteration_key(config.seed, iteration)
+        state, taken = iterate(agent, state, key, taken, functools.partial(keep, iteration))
         reporter.update(taken, "collect", {})
     reporter.stop()
     return EvaluationSet(**_joined(np.stack, kept)), Pairs(**_joined(np.concatenate, shown))

@@ -1,0 +1,91 @@
+"""Algorithm 1: one iteration of real play, learning from it, the world model and dreams, in the paper's order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from suite.agent.dyna import Agent, TrainState
+
+Call = Callable[..., Any]
+
+
+def start_key(seed: int) -> jax.Array:
+    """Randomness of a fresh agent."""
+    return jax.random.fold_in(jax.random.key(seed), 0)
+
+
+def evaluation_key(seed: int, step: int) -> jax.Array:
+    """Randomness of the evaluation at a step, apart from training's."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 1), step)
+
+
+def iteration_key(seed: int, iteration: int) -> jax.Array:
+    """Randomness of an iteration, which depends on nothing else: a run that goes on needs no other."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 2), iteration)
+
+
+def plain_call(phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """`function(*arguments)`."""
+    return function(*arguments)
+
+
+def iterate(
+    agent: Agent,
+    state: TrainState,
+    key: jax.Array,
+    steps: int,
+    call: Call = plain_call,
+    imagined_updates: Callable[[int, float | None], int] | None = None,
+) -> tuple[TrainState, int]:
+    """One iteration of Algorithm 1.
+
+    Args:
+      agent: whose phases are run.
+      state: before it; its arrays are donated.
+      key: of its randomness.
+      steps: real steps taken before it; an event of chance is none (note 32).
+      call: runs each phase, `call(phase, function, *arguments)`, and returns what the function does, so that whoever
+        asks can time it and see its results. Phases are collect, remember, learn, tokenizer, world_model and imagine;
+        the last four also return their metrics.
+      imagined_updates: how many there are after so many steps, given what share of new rewards the world model knew, if
+        that is measured; None: as the configuration says.
+
+    Returns:
+      the state after it, and the real steps taken by then.
+    """
+    config = agent.config
+    imagined_updates = imagined_updates or config.imagined_updates
+    collect_key, tokenizer_key, model_key, dream_key = jax.random.split(key, 4)
+    learner, player, replay = state.learner, state.player, state.replay
+    tokenizer, world_model = state.tokenizer, state.world_model
+    del state
+
+    # Step 1: N_env environments play T_env real steps, which enter the replay buffer.
+    player, trajectory, log = call("collect", agent.collect, learner.acting, player, collect_key)
+    before, steps = steps, steps + int(np.asarray(log.counts_TB).sum())
+    if replay is not None:
+        replay = call("remember", agent.remember, replay, trajectory)
+
+    # Step 2: the policy learns from them.
+    if config.ppo.learn_from_real and config.policy.kind != "uniform":
+        learner, _ = call("learn", agent.learn, learner, trajectory, jnp.array([before, steps], jnp.float32))
+    del trajectory, log  # their memory is the world model's now
+
+    # Step 3: tokenizer and world model learn from replayed steps.
+    known = None
+    if world_model is not None:
+        tokenizer, _ = call("tokenizer", agent.update_tokenizer, tokenizer, replay, tokenizer_key)
+        world_model, found = call("world_model", agent.update_world_model, world_model, tokenizer, replay, model_key)
+        known = float(found["reward_known"]) if "reward_known" in found else None
+
+    # Step 4: the policy learns from dreams, which begin at replayed frames.
+    if updates := imagined_updates(steps, known):
+        dreamt = None if world_model is None else world_model.dreaming
+        count = jnp.asarray(updates, jnp.int32)
+        learner, _ = call("imagine", agent.imagine, learner, dreamt, tokenizer, replay, dream_key, count)
+    return TrainState(learner, player, replay, tokenizer, world_model), steps
