@@ -34,7 +34,8 @@ COLUMNS = (
     "iqm",  # interquartile mean over seeds
     "iqm_low",  # its 95 % bootstrap interval
     "iqm_high",
-    "seeds",
+    "seeds",  # how many
+    "seed_list",  # which: "0-4", or "0-2 5"; over games those that all have in common
     "steps",
     "observation",
     "environment",
@@ -88,6 +89,17 @@ def file_name(task: str) -> str:
     return f"{task.replace('/', '_')}.csv"
 
 
+def ranges(numbers: Iterable[int]) -> str:
+    """Whole numbers in order, what follows each other as a range: {0, 1, 2, 5} as "0-2 5"."""
+    found: list[list[int]] = []
+    for number in sorted(numbers):
+        if found and number == found[-1][-1] + 1:
+            found[-1].append(number)
+        else:
+            found.append([number])
+    return " ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in found)
+
+
 def as_csv(board: pd.DataFrame) -> bytes:
     """Numbers with eight digits: what differs between machines' ways of adding up is far below."""
     return board.map(_cell).astype(str).to_csv(index=False, lineterminator="\n").encode()
@@ -125,6 +137,7 @@ def _rows(standing: Standing) -> Rows:
         "overrides": " ".join(overrides(entry.config)),
         "error_kind": "standard error",
         "seeds": len(entry.seeds),
+        "seed_list": ranges(entry.seeds),
         "steps": rules["steps"],
         "observation": _sees(entry),
         "environment": rules["package"],
@@ -157,6 +170,7 @@ def _family_rows(group: Sequence[FamilyScores]) -> Rows:
             "agent": scores.agent,
             "overrides": "",
             "seeds": min(len(entry.seeds) for entry in scores.entries),
+            "seed_list": ranges(set.intersection(*(set(entry.seeds) for entry in scores.entries))),
             "steps": rules["steps"],
             "observation": _sees(first),
             "environment": rules["package"],

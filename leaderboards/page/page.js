@@ -20,19 +20,30 @@ for (const table of document.querySelectorAll("table")) {
     const direction = header.getAttribute("aria-sort") === first ? other : first;
     for (const cell of table.tHead.rows[0].cells) cell.removeAttribute("aria-sort");
     header.setAttribute("aria-sort", direction);
-    const body = table.tBodies[0];
-    const rows = [...body.rows];
-    rows.sort((a, b) => compare(valueOf(a, header.cellIndex), valueOf(b, header.cellIndex), direction));
-    body.append(...rows);
+    for (const body of table.tBodies) {
+      const rows = [...body.querySelectorAll("tr[data-origin]")]; // what stands above a group of rows stays there
+      rows.sort((a, b) => compare(valueOf(a, header.cellIndex), valueOf(b, header.cellIndex), direction));
+      body.append(...rows);
+    }
   });
 }
 
 const filters = document.querySelector(".filters");
 filters.addEventListener("submit", (event) => event.preventDefault());
-filters.addEventListener("change", () => {
+filters.addEventListener("change", (event) => {
+  if (event.target.type === "checkbox") document.body.classList.toggle("all", event.target.checked);
   const wanted = [...new FormData(filters)].filter(([, value]) => value !== "");
-  const rows = [...document.querySelectorAll("tbody tr")];
-  for (const row of rows) row.hidden = wanted.some(([name, value]) => row.dataset[name] !== value);
+  const refused = (element) => wanted.some(([name, value]) => element.dataset[name] !== value);
+  const rows = [...document.querySelectorAll("tr[data-origin]")];
+  for (const row of rows) row.hidden = refused(row);
+  for (const figure of document.querySelectorAll("figure")) {
+    figure.hidden = "origin" in figure.dataset ? refused(figure) : wanted.length > 0; // of several budgets and sources
+  }
+  const empty = (part, what) => ![...part.querySelectorAll(what)].some((element) => !element.hidden);
+  for (const body of document.querySelectorAll("tbody")) body.hidden = empty(body, "tr[data-origin]");
+  for (const more of document.querySelectorAll("details.more")) more.hidden = empty(more, "figure");
+  for (const section of document.querySelectorAll("section")) section.hidden = empty(section, "tr[data-origin]");
+  for (const link of document.querySelectorAll("nav a")) link.hidden = document.querySelector(link.hash).hidden;
   const shown = rows.filter((row) => !row.hidden).length;
   filters.querySelector("output").textContent = wanted.length ? `${shown} of ${rows.length} rows` : "";
 });

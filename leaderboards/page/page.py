@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import markupsafe
 import pandas as pd
 
 from leaderboards.boards import IMPROVEMENT, OVERALL, as_csv, tables_digest
-from leaderboards.families import families
+from leaderboards.families import GAMES, families
 from leaderboards.page import plots
 from leaderboards.publish import PAGE
 from leaderboards.published import OF_FAMILY
@@ -25,9 +26,15 @@ from suite.record import require_writable
 from suite.tables import write_whole
 
 HERE = Path(__file__).parent
-PARTS = 20  # points of a learning curve
 BARS = 4  # agents beside each other in a bar chart, at most
-TITLES = {"craftax_classic": "Craftax-classic", "craftax_full": "Craftax (full)", "overall": "Families of games"}
+PROFILE_RUNS = 10  # of an agent: the profile of fewer is a stair
+TITLES = {
+    "craftax_classic": "Craftax-classic",
+    "craftax_full": "Craftax (full)",
+    "minatar": "MinAtar",
+    "openspiel": "OpenSpiel",
+    "overall": "Families of games",
+}
 LABELS = {
     "reward_percent": "Reward, % of the maximum",
     "reward_percent_with_health": "Reward with health, %",
@@ -45,21 +52,36 @@ OVERALL_SUMMARY = (
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """Of a table: its text, what it sorts by ("" last), and small print."""
+    """Of a table.
+
+    Attributes:
+      text: what it shows.
+      value: what it sorts by; "" stands last.
+      error: behind the text, in a line of its own where there is little room.
+      note: small print.
+      folded: what is shown when asked for, with the words to ask by.
+      numeric: stands right.
+      badge: the class of a badge around the text.
+      minor: left out on a phone, unless all columns are asked for.
+    """
 
     text: str
     value: str | float = ""
+    error: str = ""
     note: str = ""
+    folded: tuple[str, str] | None = None
     numeric: bool = False
     badge: str = ""
+    minor: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """Of a table; numbers stand right, and sort from the best down."""
+    """Of a table; numbers stand right, and sort from the best down. A minor one is left out on a phone."""
 
     label: str
     numeric: bool = False
+    minor: bool = False
 
 
 def write_page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame], folder: Path) -> Path:
@@ -91,88 +113,125 @@ def write_page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame], fol
             {"name": "origin", "label": "From", "options": [("ours", "measured here"), ("theirs", "published")]},
         ],
     )
-    write_whole(folder / PAGE, html.encode())
+    write_whole(folder / PAGE, _classes_for_styles(html).encode())
     return folder / PAGE
+
+
+def _classes_for_styles(html: str) -> str:
+    """Gives each way in which figures draw, some dozens in thousands of places, a class in place of its own words."""
+    classes: dict[str, str] = {}
+
+    def named(found: re.Match[str]) -> str:
+        return f' class="{classes.setdefault(found[1], f"f{len(classes)}")}"'
+
+    html = re.sub(r' style="([^"]*)"', named, html)
+    rules = "".join(f".{name} {{ {style} }}\n" for style, name in classes.items())
+    return html.replace("</style>", f"{rules}</style>", 1)
 
 
 def _section(name: str, table: pd.DataFrame, entries: Sequence[Entry]) -> dict[str, Any]:
     id = name.removesuffix(".csv")
     overall = name == OVERALL
     task = "" if overall else str(table["task"].iloc[0])
-    metrics = _shown(table["metric"])
     title = TITLES.get(id, task)
+    own = entries if overall else [entry for entry in entries if entry.config.task == task]
+    parts = list(table.groupby("task", sort=False)) if overall else [("", table)]
+    metrics = [] if overall else _shown(table["metric"])
     return {
         "id": id,
         "title": title,
         "summary": OVERALL_SUMMARY if overall else registry.task(task).summary,
         "caption": f"{title}: headings sort; {name} has more columns.",
-        "columns": _columns(metrics, overall),
-        "rows": list(_rows(table, metrics, overall)),
-        "figures": list(
-            _family_figures(entries) if overall else _figures([e for e in entries if e.config.task == task], table)
-        ),
+        "columns": _columns(["Score", LABELS[IMPROVEMENT]] if overall else list(map(_label, metrics))),
+        "groups": [
+            {"title": _heading(str(family), part), "rows": list(_rows(part, metrics or _shown(part["metric"], pad=2)))}
+            for family, part in parts
+        ],
+        "lead": [_with_own_ids(figure, id) for figure in _stories(own, table)],
+        "more": [
+            _with_own_ids(figure, id) for figure in (_family_figures(entries) if overall else _figures(own, table))
+        ],
     }
 
 
-def _shown(metrics: pd.Series) -> list[str]:
-    """Scores with a column of their own: each achievement's and each seat's stand in the CSV alone."""
+def _shown(metrics: pd.Series, pad: int = 0) -> list[str]:
+    """Scores with a column of their own, at least `pad`: each achievement's and each seat's stand in the CSV alone."""
     names = list(dict.fromkeys(metrics))
     names.sort(key=lambda name: name == IMPROVEMENT)
-    return [name for name in names if "/" not in name and not name.startswith(("success_percent", "return_seat"))]
+    names = [name for name in names if "/" not in name and not name.startswith(("success_percent", "return_seat"))]
+    return names + [""] * (pad - len(names))
+
+
+def _heading(family: str, part: pd.DataFrame) -> str:
+    """What a family's games are scored by, above its rows."""
+    if not family:
+        return ""
+    label = _label(_shown(part["metric"])[0])
+    return f"{TITLES.get(family, family)}: {label[0].lower()}{label[1:]}"
 
 
 def _label(metric: str) -> str:
     return LABELS.get(metric, metric.replace("_percent", " %").replace("_", " ").capitalize())
 
 
-def _columns(metrics: Sequence[str], overall: bool) -> list[Column]:
-    words = ["Rank", "Method", *(["Family"] if overall else []), "From", "Preset"]
-    numbers = [*map(_label, metrics), "Seeds", "Steps", "Minutes", "Parameters, M"]
+def _columns(scores: Sequence[str]) -> list[Column]:
     return [
-        *(Column(word, numeric=word == "Rank") for word in words),
-        *(Column(word, numeric=True) for word in numbers),
-        *(Column(word) for word in ("Sees", "Game", "Hardware", "Source")),
+        Column("Rank", numeric=True),
+        Column("Method"),
+        *(Column(score, numeric=True) for score in scores),
+        *(Column(word, minor=True) for word in ("From", "Preset")),
+        *(Column(word, numeric=True, minor=True) for word in ("Seeds", "Steps", "Minutes")),
+        Column("Source", minor=True),
     ]
 
 
-def _rows(table: pd.DataFrame, metrics: Sequence[str], overall: bool) -> Iterator[dict[str, Any]]:
+def _rows(table: pd.DataFrame, metrics: Sequence[str]) -> Iterator[dict[str, Any]]:
     """One for each method, its scores beside each other."""
     by = ["task", "preset", "protocol", "method", "overrides", "steps", "source"]
     for _, group in table.groupby(by, sort=False, dropna=False):
         scores = {row["metric"]: row for row in group.to_dict("records")}
         row = next(iter(scores.values()))
         ours = bool(row["measured_here"])
-        remark = _text(row["note"]) if ours else ""
-        method = Cell(row["method"], row["method"], "; ".join(filter(None, [_text(row["overrides"]), remark])))
-        cells = [_number(row["rank"], "{:.0f}"), method]
-        cells += [Cell(row["task"], row["task"])] if overall else []
-        cells.append(Cell("measured" if ours else "published", badge="ours" if ours else "theirs"))
-        cells.append(Cell(_text(row["preset"]), _text(row["preset"])))
-        cells += [_score(scores.get(metric)) for metric in metrics]
-        cells += [_number(row["seeds"], "{:.0f}"), _number(row["steps"], "{:,.0f}"), _number(row["minutes"], "{:,.4g}")]
-        cells.append(_number(row["parameters_millions"], "{:g}"))
-        game = f"{_text(row['environment'])} {_text(row['environment_version'])}".strip()
-        words = {"pixels": "pixels", "symbolic": "symbols"}[row["observation"]], game, _text(row["hardware"])
-        cells += [Cell(word, word) for word in words]
-        where = row["evidence"] if ours else row["source"]
-        cells.append(Cell(_text(where), _text(where), _text(row["note"])))
+        differs = _text(row["overrides"])
+        method = Cell(
+            row["method"],
+            row["method"],
+            note=_text(row["note"]) if ours else "",
+            folded=("other settings", differs) if differs else None,
+        )
+        cells = [_number(row["rank"], "{:.0f}"), method, *(_score(scores.get(metric)) for metric in metrics)]
+        origin = "measured" if ours else "published"
+        lesser = [Cell(origin, origin, badge="ours" if ours else "theirs")]
+        lesser.append(Cell(_text(row["preset"]), _text(row["preset"])))
+        which = f"which: {row['seed_list']}" if ours and row["seed_list"] else ""
+        lesser.append(dataclasses.replace(_number(row["seeds"], "{:.0f}"), note=which))
+        lesser += [_number(row["steps"], "{:,.0f}"), _number(row["minutes"], "{:,.4g}")]
+        where = _text(row["evidence"] if ours else row["source"])
+        lesser.append(Cell(where, where, folded=("more", _circumstances(row))))
         yield {
             "origin": "ours" if ours else "theirs",
             "observation": row["observation"],
             "steps": "" if pd.isna(row["steps"]) else int(row["steps"]),
-            "cells": cells,
+            "cells": cells + [dataclasses.replace(cell, minor=True) for cell in lesser],
         }
 
 
+def _circumstances(row: Mapping[Any, Any]) -> str:
+    """What else is known of a row: the game and what the agent sees of it, its size, hardware, the source's remark."""
+    game = f"{_text(row['environment'])} {_text(row['environment_version'])}".strip()
+    sees = {"pixels": "pixels", "symbolic": "symbols"}[row["observation"]]
+    size = "" if pd.isna(row["parameters_millions"]) else f"{row['parameters_millions']:g} million parameters"
+    return "; ".join(filter(None, [f"sees {sees}", game, size, _text(row["hardware"]), _text(row["note"])]))
+
+
 def _score(row: Mapping[Any, Any] | None) -> Cell:
-    """Mean and error; beside them, the interval of the interquartile mean."""
+    """Mean and error; below them, the interval of the interquartile mean."""
     if row is None:
         return Cell("", numeric=True)
-    text = _digits(row["value"])
-    if not pd.isna(row["error"]):
-        text += f" \N{PLUS-MINUS SIGN} {_digits(row['error'], row['value'])}"
+    known = not pd.isna(row["error"])
+    error = f"\N{PLUS-MINUS SIGN}\N{NO-BREAK SPACE}{_digits(row['error'], row['value'])}" if known else ""
     interval = "" if pd.isna(row["iqm_low"]) else f"[{_digits(row['iqm_low'])}, {_digits(row['iqm_high'])}]"
-    return Cell(text, row["value"], interval, numeric=True)
+    return Cell(_digits(row["value"]), row["value"], error, interval, numeric=True)
 
 
 def _digits(value: float, like: float | None = None) -> str:
@@ -188,33 +247,78 @@ def _text(value: Any) -> str:
     return "" if value is None or pd.isna(value) else str(value)
 
 
-def _figures(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Of a task: one set for each preset and protocol that runs were made under."""
-    groups: dict[tuple[str, str], list[Entry]] = {}
+def _groups(entries: Sequence[Entry]) -> dict[tuple[str, str, str], list[Entry]]:
+    """Runs that a figure may compare, by task, preset and rules: without overrides."""
+    groups: dict[tuple[str, str, str], list[Entry]] = {}
     for entry in entries:
         if not overrides(entry.config):
-            groups.setdefault((entry.config.preset, entry.protocol_hash), []).append(entry)
-    for (preset, _), group in groups.items():
-        score = main_score(group[0].scores)
-        label = _label(score).lower()
-        steps = group[0].config.protocol.steps
-        under = f"Preset {preset}, {steps:,} steps"
-        yield _figure(
-            plots.learning_curves(group, score, PARTS, label),
-            f"{under}: {label} of the training episodes that end in each twentieth of the budget; mean over seeds, "
-            "shaded its 95 % bootstrap interval.",
-        )
+            groups.setdefault((entry.config.task, entry.config.preset, entry.protocol_hash), []).append(entry)
+    return groups
+
+
+def _stories(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    """The figure that comes first, one for each family and preset: do agents learn faster with dreams?"""
+    found: dict[tuple[str, str], dict[str, list[Entry]]] = {}
+    for (task, preset, _), group in _groups(entries).items():
+        told = [entry for entry in group if entry.config.agent in plots.STORY]
+        games = found.setdefault((registry.task(task).family, preset), {})
+        if len(told) > 1 and _runs(told) > _runs(games.get(task, [])):
+            games[task] = told
+    for (family, preset), games in found.items():
+        if games:
+            order = [game for game in (*GAMES.get(family, ()), *games) if game in games]
+            panels = [_panel(games[game], table, game if len(games) > 1 else "") for game in dict.fromkeys(order)]
+            first = panels[0].entries[0]
+            yield _figure(
+                plots.learning_curves(panels),
+                f"{TITLES.get(family, family)}, preset {preset}: {panels[0].label}, of training episodes by when they "
+                "ended; mean over seeds, shaded its 95 % bootstrap interval. mfrl learns from real play alone, m5 and "
+                "m6 also from a learned world model, the oracle from the true game.",
+                first,
+            )
+
+
+def _runs(entries: Sequence[Entry]) -> int:
+    return sum(len(entry.seeds) for entry in entries)
+
+
+def _panel(entries: Sequence[Entry], table: pd.DataFrame, title: str) -> plots.Panel:
+    """Of one game; with the best published score for the same budget."""
+    score, steps = entries[0].main_score, entries[0].config.protocol.steps
+    theirs = table[
+        (table["task"] == entries[0].config.task)
+        & (table["metric"] == score)
+        & (table["steps"] == steps)
+        & ~table["measured_here"].astype(bool)
+    ]
+    best = max(zip(theirs["value"], theirs["method"], strict=True), default=None)
+    published = None if best is None else (str(best[1]), float(best[0]))
+    return plots.Panel(title, entries, score, _label(score).lower(), published)
+
+
+def _figures(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    """Of a task, the rest: one set for each preset and protocol that runs were made under."""
+    for (_, preset, _), group in _groups(entries).items():
+        panel = _panel(group, table, "")
+        score, label = panel.score, panel.label
+        under = f"Preset {preset}, {group[0].config.protocol.steps:,} steps"
+        if any(entry.config.agent not in (*plots.STORY, "random") for entry in group):
+            yield _figure(
+                plots.learning_curves([panel]), f"{under}: all agents, as in the figure above the table.", group[0]
+            )
         if group[0].spec.achievements:
             best = sorted(group, key=lambda entry: -entry.scores[score].mean())[:BARS]
             yield _figure(
                 plots.achievement_bars(best),
                 f"{under}: training episodes that unlocked each achievement, the {len(best)} best agents by {label}; "
                 "achievements that none of them unlocked are left out.",
+                group[0],
             )
-        several = [entry for entry in group if len(entry.seeds) > 1]  # one run has no share of runs
+        several = [entry for entry in group if len(entry.seeds) >= PROFILE_RUNS]
         if several:
             profiles = {entry.config.agent: [entry.scores[score]] for entry in several}
-            yield _figure(plots.performance_profiles(profiles, label), f"{under}: the share of runs above a {label}.")
+            caption = f"{under}: the share of runs above a {label}."
+            yield _figure(plots.performance_profiles(profiles, label), caption, group[0])
     points = _points(table)
     if len(points) > 1:
         score = points[0][0]
@@ -247,12 +351,23 @@ def _family_figures(entries: Sequence[Entry]) -> Iterator[dict[str, Any]]:
                 plots.performance_profiles(profiles, label),
                 f"{first.family}, preset {first.entries[0].config.preset}: the share of runs above a {label}; "
                 f"mean over {len(first.entries)} games.",
+                first.entries[0],
             )
 
 
-def _figure(svg: str, caption: str) -> dict[str, Any]:
-    """Ids are unique on the page: every figure has those of its own."""
-    prefix = hashlib.sha256(svg.encode()).hexdigest()[:8]
+def _figure(svg: str, caption: str, of: Entry | None = None) -> dict[str, Any]:
+    """`of`: whose task and budget it belongs to, by which it is filtered."""
+    facts = {}
+    if of is not None:
+        seen = "pixels" if of.spec.observation.kind == "pixels" else "symbolic"
+        facts = {"origin": "ours", "observation": seen, "steps": of.config.protocol.steps}
+    return {"svg": svg, "caption": caption, "facts": facts}
+
+
+def _with_own_ids(figure: dict[str, Any], section: str) -> dict[str, Any]:
+    """Ids are unique on the page: every figure has those of its own, also where two sections show the same one."""
+    svg = figure["svg"]
+    prefix = hashlib.sha256(f"{section} {svg}".encode()).hexdigest()[:8]
     for mark in ('id="', 'href="#', "url(#"):
         svg = svg.replace(mark, f"{mark}{prefix}-")
-    return {"svg": markupsafe.Markup(svg), "caption": caption}
+    return figure | {"svg": markupsafe.Markup(svg)}

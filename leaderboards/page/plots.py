@@ -6,8 +6,10 @@ theirs. Agents are told apart by dashes and markers as well.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import io
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,7 +20,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from leaderboards import statistics
 from leaderboards.results import Entry
@@ -27,9 +29,11 @@ from suite import registry
 INK, GRID = "#010203", "#030201"  # stand-ins that no figure has by itself
 SERIES = tuple(f"#0a0b{i:02x}" for i in range(8))
 VARIABLES = {INK: "var(--ink)", GRID: "var(--grid)"} | {color: f"var(--series-{i})" for i, color in enumerate(SERIES)}
-MOST = ("random", "mfrl", "m1", "m2", "m3", "m4", "m5", "m5_slow")  # each with a colour of its own
+STORY = ("mfrl", "m5", "m6", "oracle")  # what a learning curve shows first: without dreams, with them, with true ones
+MOST = (*STORY, "random", "m1", "m2", "m3")  # each with a colour of its own
 DASHES = ("-", (0, (5, 2)), (0, (1, 1.5)))
 MARKERS = "osD^vPX*"
+PARTS = (20, 10, 5, 2)  # points of a learning curve
 WIDTH, HEIGHT = 5.6, 3.6  # inches of 72 points: text keeps its size on a phone
 STYLE: Any = {
     "svg.fonttype": "none",  # text stays text
@@ -51,27 +55,69 @@ STYLE: Any = {
 }
 
 
-def learning_curves(entries: Sequence[Entry], score: str, parts: int, label: str) -> str:
-    """A score against steps: mean over seeds, and its 95 % bootstrap interval where there are several seeds."""
-    steps = entries[0].config.protocol.steps
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """The learning curves of one game.
+
+    Attributes:
+      title: stands above it, "" for nothing.
+      entries: agents that played under the same rules, each a curve.
+      score: which one, by its name.
+      label: what to call it.
+      published: the best published score for the same budget, with its method's name, where there is one.
+    """
+
+    title: str
+    entries: Sequence[Entry]
+    score: str
+    label: str
+    published: tuple[str, float] | None = None
+
+
+def learning_curves(panels: Sequence[Panel]) -> str:
+    """A score against steps, game by game: mean over seeds, and its 95 % bootstrap interval where there are several.
+
+    A point is over the episodes that end in a part of the budget: a twentieth, or more where games last so long that
+    none of some run ends in one.
+    """
+    columns = min(2, len(panels))
+    rows = math.ceil(len(panels) / columns)
+    with _figure(rows * (HEIGHT if columns == 1 else HEIGHT * 0.72), rows, columns) as (figure, grid):
+        for axes, panel in zip(grid, panels, strict=False):
+            _learning_curve(axes, panel)
+        for axes in grid[len(panels) :]:
+            axes.set_axis_off()
+        _legend(figure)
+        what = ", ".join(dict.fromkeys(panel.label for panel in panels))
+        return _svg(figure, f"Learning curves: {what} against real environment steps")
+
+
+def _learning_curve(axes: Axes, panel: Panel) -> None:
+    steps = panel.entries[0].config.protocol.steps
+    for parts in PARTS:
+        curves = [entry.curve(panel.score, parts) for entry in panel.entries]
+        if not any(np.isnan(curve_PS).any() for curve_PS in curves):
+            break
     at = (np.arange(parts) + 1) * steps / parts
-    with _figure() as (figure, axes):
-        for entry in entries:
-            mean_P, low_P, high_P = statistics.sample_efficiency_curve(entry.curve(score, parts))
-            color, dashes, _ = style_of(entry.config.agent)
-            axes.plot(at, mean_P, color=color, linestyle=dashes, label=entry.config.agent)
+    for entry, curve_PS in zip(panel.entries, curves, strict=True):
+        mean_P, low_P, high_P = statistics.sample_efficiency_curve(curve_PS)
+        color, dashes, _ = style_of(entry.config.agent)
+        axes.plot(at, mean_P, color=color, linestyle=dashes, label=entry.config.agent)
+        if len(entry.seeds) > 1:
             axes.fill_between(at, low_P, high_P, color=color, alpha=0.18, linewidth=0)
-        axes.set(xlabel="real environment steps", ylabel=label, xlim=(0, steps))
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k")
-        _legend(axes)
-        return _svg(figure, f"Learning curves: {label} against real environment steps")
+    if panel.published is not None:
+        method, value = panel.published
+        axes.axhline(value, color=INK, linewidth=0.8, linestyle=(0, (4, 3)), label=f"published: {method}")
+    axes.set(xlabel="real environment steps", ylabel=panel.label, xlim=(0, steps), title=panel.title)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k")
 
 
 def achievement_bars(entries: Sequence[Entry]) -> str:
     """The percentage of training episodes that unlocked each achievement; those that nobody unlocked are left out."""
     names = [name for name in entries[0].spec.achievements if _success(entries, name).any()]
     names.sort(key=lambda name: _success(entries, name).max())
-    with _figure(height=0.9 + len(names) * (0.13 + 0.075 * len(entries))) as (figure, axes):
+    with _figure(height=0.9 + len(names) * (0.13 + 0.075 * len(entries))) as (figure, (axes,)):
         thickness = 0.8 / len(entries)
         for i, entry in enumerate(entries):
             values = [entry.scores[f"success_percent/{name}"].mean() for name in names]
@@ -80,7 +126,7 @@ def achievement_bars(entries: Sequence[Entry]) -> str:
         axes.set_yticks(np.arange(len(names)), [name.replace("_", " ") for name in names])
         axes.set(xlabel="episodes that unlocked it, %", xlim=(0, 100), ylim=(-0.6, len(names) - 0.4))
         axes.grid(False, axis="y")
-        _legend(axes)
+        _legend(figure)
         return _svg(figure, "Bars: percentage of training episodes that unlocked each achievement")
 
 
@@ -88,20 +134,20 @@ def performance_profiles(scores: Mapping[str, Sequence[np.ndarray]], label: str)
     """By agent, each task's seeds: the share of runs above each threshold (Agarwal et al. 2021)."""
     top = max(values.max() for tasks in scores.values() for values in tasks)
     thresholds = np.linspace(0, 1.05 * top, 101)
-    with _figure() as (figure, axes):
+    with _figure() as (figure, (axes,)):
         for agent, tasks in scores.items():
             share = np.mean([statistics.performance_profile(values, thresholds) for values in tasks], axis=0)
             color, dashes, _ = style_of(agent)
             axes.plot(thresholds, share, color=color, linestyle=dashes, label=agent, drawstyle="steps-post")
         axes.set(xlabel=label, ylabel="share of runs above", ylim=(0, 1.03), xlim=(0, thresholds[-1]))
-        _legend(axes)
+        _legend(figure)
         return _svg(figure, f"Performance profiles: share of runs whose {label} is above a threshold")
 
 
 def time_against_score(points: Sequence[tuple[str, str, float, float]], label: str) -> str:
     """Each (method, agent id or "" if published, minutes, score): ours filled, published hollow."""
     points = sorted(points, key=lambda point: point[3])
-    with _figure(height=max(HEIGHT, 0.9 + 0.19 * len(points))) as (figure, axes):
+    with _figure(height=max(HEIGHT, 0.9 + 0.19 * len(points))) as (figure, (axes,)):
         axes.set(xscale="log", xlabel="minutes of one run, wall-clock", ylabel=label)
         for _, agent, minutes, score in points:
             color, _, marker = style_of(agent) if agent else (INK, "-", "o")
@@ -150,16 +196,28 @@ def _success(entries: Sequence[Entry], name: str) -> np.ndarray:
 
 
 @contextmanager
-def _figure(height: float = HEIGHT) -> Iterator[tuple[Figure, Axes]]:
+def _figure(height: float = HEIGHT, rows: int = 1, columns: int = 1) -> Iterator[tuple[Figure, list[Axes]]]:
+    """A figure and its axes, row by row."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, height), layout="constrained")
         FigureCanvasSVG(figure)
-        yield figure, figure.add_subplot()
+        yield figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 
-def _legend(axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    axes.figure.legend(handles, labels, loc="outside upper left", ncols=5, handlelength=1.6, columnspacing=1.0)
+def _legend(figure: Figure) -> None:
+    """Each name once, whichever axes it is in."""
+    found: dict[Any, Any] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    figure.legend(
+        handles=list(found.values()),
+        labels=list(found),
+        loc="outside upper left",
+        ncols=5,
+        handlelength=1.6,
+        columnspacing=1.0,
+    )
 
 
 def _svg(figure: Figure, description: str) -> str:
@@ -177,4 +235,20 @@ def _svg(figure: Figure, description: str) -> str:
     )
     for color, variable in VARIABLES.items():
         text = text.replace(color, variable)
-    return text
+    return _light(text)
+
+
+def _light(svg: str) -> str:
+    """The same picture in a third of the bytes: no names that nothing refers to, coordinates to a tenth of a point."""
+    used = set(re.findall(r'(?:href="#|url\(#)([^")]*)', svg))
+    svg = re.sub(r' id="([^"]*)"', lambda found: found[0] if found[1] in used else "", svg)
+    svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
+    svg = re.sub(r" font-family: [^;\"]*;", "", svg)  # the page's own
+    svg = re.sub(r' transform="rotate\(-0 [^"]*"', "", svg)
+
+    def rounded(found: re.Match[str]) -> str:
+        numbers = re.sub(r"-?[0-9]+\.[0-9]+", lambda number: f"{float(number[0]):.1f}".removesuffix(".0"), found[2])
+        return f'{found[1]}"{" ".join(numbers.replace("L", "").split())}"'  # lines follow a first point by themselves
+
+    svg = re.sub(r'( (?:d|x|y|x1|x2|y1|y2|width|height|transform|points)=)"([^"]*)"', rounded, svg)
+    return re.sub(r">\s+<", "><", svg)
