@@ -1,4 +1,4 @@
-"""Dreams teach only where the world model foresees rewards."""
+"""What the world model learns from; and dreams teach only where it foresees rewards."""
 
 from __future__ import annotations
 
@@ -48,16 +48,49 @@ def test_the_window_needs_trust():
         registry.resolve("minatar/breakout", "m5", "small", ["imagination.trust_window=10"])
 
 
-def test_the_newest_steps_measure_a_model_that_has_not_learned_from_them(monkeypatch):
-    """The buffer holds two iterations: no step of the first one pays, every step of the second one does."""
-    monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
-    changes = ["imagination.trust=0.7", "imagination.trust_window=2", "world_model.patch_contents=true"]
-    config = registry.resolve("wide_corridor", "m5", "smoke", changes)
-    agent = Agent(config, WideCorridor())
-    state = agent.init(jax.random.key(0))
-    _, trajectory, _ = agent.collect(state.learner.acting, state.player, jax.random.key(1))
+@pytest.fixture(scope="module")
+def agent():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
+        changes = ["imagination.trust=0.7", "imagination.trust_window=2", "world_model.patch_contents=true"]
+        return Agent(registry.resolve("wide_corridor", "m5", "smoke", changes), WideCorridor())
+
+
+def played(agent):
+    """The state of a fresh agent, and the two trajectories that its buffer has room for."""
+    state, player, trajectories = agent.init(jax.random.key(0)), None, []
+    for key in jax.random.split(jax.random.key(1), 2):
+        player, trajectory, _ = agent.collect(state.learner.acting, player or state.player, key)
+        trajectories.append(trajectory)
+    return state, trajectories
+
+
+def test_it_learns_what_each_action_led_to(agent):
+    """In the corridor frame and action say which frame, reward and end come next."""
+    state, trajectories = played(agent)
     replay = state.replay
-    for reward in (0, 1):
+    for trajectory in trajectories:
+        replay = agent.remember(replay, trajectory)
+    tokenizer, _ = agent.update_tokenizer(state.tokenizer, replay, jax.random.key(3))
+    bright_K = agent.tokenizer.contents(tokenizer).mean(-1) > 0.5
+    keys = jax.random.split(jax.random.key(2), 32)
+    shown = jax.jit(jax.vmap(lambda key: agent._replayed(tokenizer, replay, key)))(keys)
+    position_BT = np.argmax(bright_K[shown.tokens_BTL], axis=-1)  # B: 32 minibatches of sequences
+    before_BT, after_BT = position_BT[..., :-1], position_BT[..., 1:]
+    arrives_BT = (before_BT == 2) & (shown.action_BT == 1)
+    assert arrives_BT.any()
+    np.testing.assert_array_equal(shown.reward_BT, arrives_BT)
+    np.testing.assert_array_equal(shown.terminated_BT, arrives_BT)
+    moved_BT = np.clip(before_BT + 2 * shown.action_BT - 1, 0, 3)
+    np.testing.assert_array_equal(after_BT[~shown.ended_BT], moved_BT[~shown.ended_BT])
+    assert shown.ended_BT[arrives_BT].all()
+
+
+def test_the_newest_steps_measure_a_model_that_has_not_learned_from_them(agent):
+    """The buffer holds two iterations: no step of the first one pays, every step of the second one does."""
+    state, trajectories = played(agent)
+    replay = state.replay
+    for reward, trajectory in enumerate(trajectories):
         paid = dataclasses.replace(trajectory, reward_TB=jnp.full_like(trajectory.reward_TB, reward))
         replay = agent.remember(replay, paid)
     tokenizer, _ = agent.update_tokenizer(state.tokenizer, replay, jax.random.key(3))
