@@ -182,7 +182,11 @@ def check_auto_reset(play: Play) -> None:
 
 @functools.cache
 def _programs(environment: Environment, num_envs: int, steps: int):
-    """Compiled once for each environment object: reset and T events of a batch, T steps by hand, a reset by hand."""
+    """Compiled once for each environment object: reset of a batch, T events of it, a reset by hand.
+
+    An event is what the batch makes of it, and what stepping alone does: in one program, as a large game takes a minute
+    to compile.
+    """
     batched = Batched(environment, num_envs)
 
     def event(carry, key):
@@ -194,30 +198,26 @@ def _programs(environment: Environment, num_envs: int, steps: int):
             legal = jnp.where(shown.turn.legal_A, 0.0, -jnp.inf)
             ours_B = jax.random.categorical(action_key, legal).astype(jnp.int32)
             action_B = choose_event(turn_key, shown.turn, ours_B)
+        by_hand = jax.vmap(environment.step)(jax.random.split(step_key, (2, num_envs))[0], state, action_B)
         carry = batched.step(step_key, state, action_B)
-        return carry, (carry, step_key, action_B)
-
-    def by_hand(_, before):
-        state, key, action_B = before
-        return None, jax.vmap(environment.step)(jax.random.split(key, (2, num_envs))[0], state, action_B)
+        return carry, (carry, by_hand, step_key)
 
     return (
         jax.jit(batched.reset),
         jax.jit(lambda carry, key: jax.lax.scan(event, carry, jax.random.split(key, steps))),
-        jax.jit(lambda states, keys, actions: jax.lax.scan(by_hand, None, (states, keys, actions))[1]),
         jax.jit(environment.reset),
     )
 
 
 def _play(environment, key, steps, num_envs, prepare) -> tuple[Play, list[TimeStep]]:
     """The play, and what went on from there."""
-    reset, events, by_hand, reset_one = _programs(environment, num_envs, steps)
+    reset, events, reset_one = _programs(environment, num_envs, steps)
     reset_key, events_key = jax.random.split(key)
     state, shown = reset(reset_key)
     _equal(shown, reset(reset_key)[1])
     assert bool(shown.first.all())
     start = prepare(state), shown
-    carry, (after, keys, actions) = events(start, events_key)
+    carry, (after, by_hand, keys) = events(start, events_key)
     _equal(after, events(start, events_key)[1][0])  # the same key, state and actions give the same
     further = []
     for played in range(steps, max(REWARDS // num_envs, 2 * steps), steps):
@@ -226,8 +226,7 @@ def _play(environment, key, steps, num_envs, prepare) -> tuple[Play, list[TimeSt
     assert events._cache_size() == 1, "a step's output makes a step compile again"
     states = jax.tree.map(lambda one, many: jnp.concatenate([one[None], many]), start[0], after[0])
     shown = _following(start[1], after[1])
-    before, states, shown = jax.tree.map(lambda a: a[:-1], states), *jax.tree.map(_numpy, (states, shown))
-    stepped_states, stepped = jax.tree.map(_numpy, by_hand(before, keys, actions))
+    states, shown, (stepped_states, stepped) = jax.tree.map(_numpy, (states, shown, by_hand))
     fresh_states, fresh = jax.tree.map(np.zeros_like, (stepped_states, stepped))
     reset_keys_TB = jax.vmap(lambda key: jax.random.split(key, (2, num_envs))[1])(keys)
     for t, b in zip(*np.nonzero(stepped.terminated | stepped.truncated), strict=True):

@@ -9,7 +9,7 @@ import pytest
 from adapters.craftax import CraftaxClassic
 from tests.contract import check_environment
 
-STEPS, BATCH = 250, 8  # as tests/test_contract.py plays it, so that compiled programs are found in the cache
+STEPS, BATCH = 250, 8
 LAVA = 14  # craftax's BlockType
 
 

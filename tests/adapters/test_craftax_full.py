@@ -15,7 +15,7 @@ from suite.interface.batching import Batched
 from tests.adapters.frames import check_equal, original_renderer
 from tests.contract import check_environment
 
-STEPS, BATCH = 250, 8  # as tests/test_contract.py plays it, so that compiled programs are found in the cache
+STEPS, BATCH = 250, 8
 FRAMES = 256
 NECROMANCER = 32  # of craftax's BlockType
 BOSS_LEVEL = 8

@@ -67,8 +67,9 @@ def test_every_single_agent_task_is_registered():
         assert gymnasium.spec(f"suite/{id.replace('/', '_')}-v0").kwargs == {"task": id}
 
 
-@pytest.mark.parametrize("id", EXPORTED)
+@pytest.mark.parametrize("id", [id for id in EXPORTED if id != "craftax_full"])
 def test_check_env(id):
+    """Craftax (full) goes the way of Craftax-classic; compiling it alone takes half a minute."""
     check_env(gymnasium.make(f"adapters:suite/{id.replace('/', '_')}-v0").unwrapped)
 
 
