@@ -55,6 +55,19 @@ def test_everything_registered_can_be_imported():
         assert callable(agent.configure())
 
 
+def test_the_catalog_names_each_part_where_it_lives():
+    """Imports by strings, which the import linter does not see."""
+    tasks, agents = registry.tasks().values(), registry.agents().values()
+    named = {
+        "adapters": [lazy for task in tasks for lazy in (task.spec, task.make, task.own_auto_reset, task.symbols)],
+        "leaderboards.scoring": [task.scores for task in tasks],
+        "baselines": [lazy for task in tasks for lazy in task.presets.values()] + [a.configure for a in agents],
+    }
+    for place, parts in named.items():
+        modules = {lazy.reference.partition(":")[0] for lazy in parts if lazy is not None}
+        assert modules and all(f"{module}.".startswith(f"{place}.") for module in modules), place
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
