@@ -17,6 +17,7 @@ from leaderboards.published import OF_FAMILY, published
 from leaderboards.qualification import evidence_files, overrides
 from leaderboards.results import Entry
 from suite import registry
+from suite.record_schema import DeviceFields, RecordFields
 
 COLUMNS = (
     "task",
@@ -124,7 +125,7 @@ def _cell(value: Any) -> str:
 def _rows(standing: Standing) -> Rows:
     """One for each score of an entry."""
     entry, record = standing.entry, standing.entry.records[0]
-    rules = record.fields["protocol"]
+    rules = record.fields.protocol
     digest = hashlib.sha256()
     for member in entry.records:
         for name, content in evidence_files(member.folder).items():
@@ -138,15 +139,15 @@ def _rows(standing: Standing) -> Rows:
         "error_kind": "standard error",
         "seeds": len(entry.seeds),
         "seed_list": ranges(entry.seeds),
-        "steps": rules["steps"],
+        "steps": rules.steps,
         "observation": _sees(entry),
-        "environment": rules["package"],
-        "environment_version": rules["package_version"],
+        "environment": rules.package,
+        "environment_version": rules.package_version,
         "protocol": entry.protocol_hash,
-        "hardware": _each(_device(member.fields["device"]) for member in entry.records),
+        "hardware": _each(_device(member.fields.device) for member in entry.records),
         "minutes": float(entry.minutes.mean()),
         "packages": _each(_packages(member.fields) for member in entry.records),
-        "git_commit": _each(str(member.fields["git_commit"]) for member in entry.records),
+        "git_commit": _each(str(member.fields.git_commit) for member in entry.records),
         "measured_here": True,
         "source": SOURCE,
         "note": _note(entry.config.agent),
@@ -162,7 +163,7 @@ def _family_rows(group: Sequence[FamilyScores]) -> Rows:
     rows: Rows = []
     for scores in group:
         first = scores.entries[0]
-        rules = first.records[0].fields["protocol"]
+        rules = first.records[0].fields.protocol
         common = {
             "task": scores.family,
             "preset": first.config.preset,
@@ -171,10 +172,10 @@ def _family_rows(group: Sequence[FamilyScores]) -> Rows:
             "overrides": "",
             "seeds": min(len(entry.seeds) for entry in scores.entries),
             "seed_list": ranges(set.intersection(*(set(entry.seeds) for entry in scores.entries))),
-            "steps": rules["steps"],
+            "steps": rules.steps,
             "observation": _sees(first),
-            "environment": rules["package"],
-            "environment_version": rules["package_version"],
+            "environment": rules.package,
+            "environment_version": rules.package_version,
             "minutes": float(sum(entry.minutes.mean() for entry in scores.entries)),
             "measured_here": True,
             "source": SOURCE,
@@ -231,10 +232,10 @@ def _each(words: Iterable[str]) -> str:
     return "; ".join(dict.fromkeys(words))
 
 
-def _device(fields: Mapping[str, Any]) -> str:
-    return f"{fields['cpu_cores']} CPU cores" if fields["platform"] == "cpu" else str(fields["kind"])
+def _device(fields: DeviceFields) -> str:
+    return f"{fields.cpu_cores} CPU cores" if fields.platform == "cpu" else fields.kind
 
 
-def _packages(fields: Mapping[str, Any]) -> str:
-    versions = {"python": fields["python"], **fields["packages"]}
+def _packages(fields: RecordFields) -> str:
+    versions = {"python": fields.python, **fields.packages}
     return " ".join(f"{name}=={version}" for name, version in versions.items())

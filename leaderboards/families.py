@@ -54,7 +54,7 @@ def families(entries: Sequence[Entry]) -> list[list[FamilyScores]]:
     """
     groups: dict[tuple[Any, ...], dict[str, dict[str, Entry]]] = {}
     for entry in entries:
-        config, rules = entry.config, entry.records[0].fields["protocol"]
+        config, rules = entry.config, entry.records[0].fields.protocol.model_dump()
         family = registry.task(config.task).family
         if config.task in GAMES.get(family, ()) and not overrides(config):
             key = (family, config.preset, *(rules[name] for name in sorted(rules) if name != "task"))

@@ -131,7 +131,7 @@ def _examined(kept: list[Path], new: list[Path]) -> tuple[list[RunRecord], list[
             records.append(found)
     seen: dict[tuple[int, str, str], list[RunRecord]] = {}
     for record in records:
-        run = (record.config.seed, hash_of(settings(record.config)), record.fields["protocol_hash"])
+        run = (record.config.seed, hash_of(settings(record.config)), record.fields.protocol_hash)
         seen.setdefault(run, []).append(record)
     qualified = []
     for same in seen.values():

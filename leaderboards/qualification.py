@@ -84,15 +84,15 @@ def _reasons(record: RunRecord) -> Iterator[str]:
     if config.preset == NOT_RANKED:
         yield f"preset {config.preset} is for tests"
     if not record.finished:
-        yield f"unfinished ({fields['status']}): {record.steps:,} of {config.protocol.steps:,} steps"
+        yield f"unfinished ({fields.status}): {record.steps:,} of {config.protocol.steps:,} steps"
         return
     for name in ("task", "agent", "preset", "seed"):
-        if fields.get(name) != getattr(config, name):
-            yield f"record.json says {name}={fields.get(name)}, config.json {getattr(config, name)}"
-    if fields.get("config_digest") != _stored_digest(record.folder):
-        yield f"config.json is not the configuration that was run ({fields.get('config_digest')})"
-    if str(fields.get("git_commit")).endswith("-dirty"):
-        yield f"made by changed code ({fields['git_commit']}): commit it first, then run"
+        if getattr(fields, name) != getattr(config, name):
+            yield f"record.json says {name}={getattr(fields, name)}, config.json {getattr(config, name)}"
+    if fields.config_digest != _stored_digest(record.folder):
+        yield f"config.json is not the configuration that was run ({fields.config_digest})"
+    if str(fields.git_commit).endswith("-dirty"):
+        yield f"made by changed code ({fields.git_commit}): commit it first, then run"
     yield from _protocol_reasons(record)
     yield from _episode_reasons(record)
 
@@ -105,18 +105,18 @@ def _stored_digest(folder: Path) -> str:
 
 def _protocol_reasons(record: RunRecord) -> Iterator[str]:
     """The rules in the record must be those of its configuration, and those of its preset."""
-    config, rules = record.config, record.fields["protocol"]
-    if record.fields.get("protocol_hash") != hash_of(rules):
+    config, rules = record.config, record.fields.protocol
+    if record.fields.protocol_hash != rules.hash:
         yield "protocol_hash is not that of the protocol"
     ours = protocol(config, record.spec)
     preset = protocol(registry.resolve(config.task, config.agent, config.preset), record.spec)
-    for name in preset.keys() | rules.keys():
+    for name, value in rules:
         if name == "package_version":  # other versions are ranked apart, not refused
             continue
-        if rules.get(name) != ours.get(name):
-            yield f"another protocol: record.json has {name}={rules.get(name)}, config.json {ours.get(name)}"
-        elif rules.get(name) != preset.get(name):
-            yield f"another protocol: {name}={rules.get(name)}, preset {config.preset} has {preset.get(name)}"
+        if value != getattr(ours, name):
+            yield f"another protocol: record.json has {name}={value}, config.json {getattr(ours, name)}"
+        elif value != getattr(preset, name):
+            yield f"another protocol: {name}={value}, preset {config.preset} has {getattr(preset, name)}"
     # Iterations are whole, and of a game's events not all count: the budget is used up when no iteration fits any more.
     steps, budget = record.steps, config.protocol.steps
     if not budget - config.steps_per_iteration < steps <= budget:

@@ -38,7 +38,7 @@ class Entry:
     @property
     def protocol_hash(self) -> str:
         """Of the rules that all its runs were made under."""
-        return self.records[0].fields["protocol_hash"]
+        return self.records[0].fields.protocol_hash
 
     @functools.cached_property
     def spec(self) -> EnvironmentSpec:
@@ -104,7 +104,7 @@ def entries_of(records: Iterable[RunRecord]) -> list[Entry]:
     groups: dict[tuple[str, str, str, str], list[RunRecord]] = {}
     for record in records:
         config = record.config
-        key = (config.task, config.preset, record.fields["protocol_hash"], hash_of(settings(config)))
+        key = (config.task, config.preset, record.fields.protocol_hash, hash_of(settings(config)))
         groups.setdefault(key, []).append(record)
 
     def place(item: tuple[tuple[str, str, str, str], list[RunRecord]]) -> tuple[str, str, str, int, str, str]:

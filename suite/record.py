@@ -21,7 +21,6 @@ import contextlib
 import datetime
 import errno
 import fcntl
-import json
 import os
 import platform
 from collections.abc import Iterable, Iterator, Mapping
@@ -31,12 +30,12 @@ from typing import IO, TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from suite import registry
-from suite.config import Config, hash_of
+from suite.config import Config
 from suite.errors import RunError, UserError
 from suite.overrides import dotted, first_problem
-from suite.record_schema import SCHEMA, RecordFields
+from suite.record_schema import SCHEMA, ProtocolFields, RecordFields, read_json, write_json
 from suite.surroundings import package_version, peak_memory, surroundings
-from suite.tables import Table, write_whole
+from suite.tables import Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,15 +89,15 @@ def _says_disk_full(error: BaseException | None) -> bool:
     return False
 
 
-def protocol(config: Config, spec: EnvironmentSpec) -> dict[str, Any]:
+def protocol(config: Config, spec: EnvironmentSpec) -> ProtocolFields:
     """What must be equal for two results to be compared: budget, scoring, task, and the version of its rules."""
-    return {
-        "task": config.task,
-        "steps": config.protocol.steps,
-        "final_fraction": config.protocol.final_fraction,
-        "package": spec.package,
-        "package_version": package_version(spec.package) if spec.package else "",
-    }
+    return ProtocolFields(
+        task=config.task,
+        steps=config.protocol.steps,
+        final_fraction=config.protocol.final_fraction,
+        package=spec.package,
+        package_version=package_version(spec.package) if spec.package else "",
+    )
 
 
 def episode_columns(spec: EnvironmentSpec) -> list[str]:
@@ -117,13 +116,13 @@ class RunRecord:
     """
 
     def __init__(
-        self, folder: Path, config: Config, fields: dict[str, Any], spec: EnvironmentSpec | None, lock: IO[str] | None
+        self, folder: Path, config: Config, fields: RecordFields, spec: EnvironmentSpec | None, lock: IO[str] | None
     ):
         """Use `create`, `open` or `open_or_create`."""
         self.folder, self.config, self.fields, self._lock = folder, config, fields, lock
         self._spec = spec
         self._tables = {
-            name: Table(folder / f"{name}.csv", columns) for name, columns in fields["columns"].items() if lock
+            name: Table(folder / f"{name}.csv", columns) for name, columns in fields.columns.items() if lock
         }
         self._events: Any = None
         self._purge_step: int | None = None
@@ -143,34 +142,34 @@ class RunRecord:
             lock.close()
             raise UserError(f"{folder} already holds {taken[0].name}; choose another --out")
         rules = protocol(config, spec)
-        fields = {
-            "schema": SCHEMA,
-            "task": config.task,
-            "agent": config.agent,
-            "preset": config.preset,
-            "seed": config.seed,
-            "config_digest": config.digest(),
-            "protocol": rules,
-            "protocol_hash": hash_of(rules),
-            "max_return": spec.max_return,
-            "achievements": list(spec.achievements),
-            "columns": {
+        fields = RecordFields(
+            schema=SCHEMA,
+            task=config.task,
+            agent=config.agent,
+            preset=config.preset,
+            seed=config.seed,
+            config_digest=config.digest(),
+            protocol=rules,
+            protocol_hash=rules.hash,
+            max_return=spec.max_return,
+            achievements=list(spec.achievements),
+            columns={
                 "episodes": episode_columns(spec),
                 "evaluations": episode_columns(spec),
                 "metrics": None,  # those of the first row
                 "timing": None,
             },
-            "status": "running",
-            "steps": 0,
-            "started": _now(),
-            "ended": None,
-            "wall_clock_seconds": {"total": 0.0},
-            "peak_memory_bytes": {},
+            status="running",
+            steps=0,
+            started=_now(),
+            ended=None,
+            wall_clock_seconds={"total": 0.0},
+            peak_memory_bytes={},
             **surroundings(),
-            "resumed": [],
-        }
-        _write_json(folder / "config.json", config.as_dict())
-        _write_json(folder / "record.json", fields)  # last: a folder is a run from here on
+            resumed=[],
+        )
+        write_json(folder / "config.json", config.as_dict())
+        fields.write(folder)  # last: a folder is a run from here on
         record = cls(folder, config, fields, spec, lock)
         record._new = True
         return record
@@ -190,15 +189,15 @@ class RunRecord:
         Raises:
           UserError: no run folder, another schema, damaged, another run than expected, or in use.
         """
-        _read_fields(folder)  # nothing, not even a lock, is written into a folder that holds no run
+        RecordFields.read(folder)  # nothing, not even a lock, is written into a folder that holds no run
         held = _acquire(folder) if lock else None
         try:
-            fields = _read_fields(folder)
+            fields = RecordFields.read(folder)
             stored = _read_config(folder)
             if config is not None:
                 _require_same_run(folder, stored, config)
             if config is not None and spec is not None:
-                _require_same_rules(folder, fields["protocol"], protocol(config, spec))
+                _require_same_rules(folder, fields.protocol, protocol(config, spec))
             return cls(folder, config or stored, fields, spec, held)
         except BaseException:
             if held is not None:
@@ -215,17 +214,17 @@ class RunRecord:
     @property
     def finished(self) -> bool:
         """Whether the run took all its steps."""
-        return self.fields["status"] == "finished"
+        return self.fields.status == "finished"
 
     @property
     def steps(self) -> int:
         """Real environment steps recorded so far."""
-        return self.fields["steps"]
+        return self.fields.steps
 
     @property
     def wall_seconds(self) -> float:
         """Seconds that the run took, over all processes that worked on it."""
-        return self.fields["wall_clock_seconds"]["total"]
+        return self.fields.wall_clock_seconds["total"]
 
     @property
     def spec(self) -> EnvironmentSpec:
@@ -257,7 +256,7 @@ class RunRecord:
         from suite.event_files import EventFile
 
         self._append("metrics", [row], names)
-        self.fields["steps"] = int(row["step"])
+        self.fields.steps = int(row["step"])
         if self._events is None:
             self._events = EventFile(self.folder / "tensorboard", self._purge_step)
         numbers = {name: float(value) for name, value in row.items() if value is not None and name != "step"}
@@ -291,27 +290,26 @@ class RunRecord:
         number = 1 + sum(1 for _ in folders.glob("*"))
         aside = folders / f"{number:04d}_after_step_{step}"
         moved = 0
-        for name, columns in self.fields["columns"].items():
+        for name, columns in self.fields.columns.items():
             moved += self._tables[name].rewind(step, aside / f"{name}.csv")
             self._tables[name] = Table(self.folder / f"{name}.csv", columns)
         if not self._new:  # a run that has only just begun is not resumed
             self._purge_step = step + 1
             resumed = {"step": step, "date": _now(), **surroundings()}
-            self.update(steps=step, resumed=[*self.fields["resumed"], resumed])
+            self.update(steps=step, resumed=[*self.fields.resumed, resumed])
         return moved
 
     def update(self, **fields: Any) -> None:
         """Replaces fields of record.json."""
-        if unknown := fields.keys() - self.fields.keys():
-            raise ValueError(f"record.json has no field {', '.join(sorted(unknown))}")
+        replaced = self.fields.replaced(**fields)
         self._require_own_folder()
-        self.fields |= fields
-        _write_json(self.folder / "record.json", self.fields)
+        self.fields = replaced
+        self.fields.write(self.folder)
 
     def add_wall_clock(self, seconds: float, phases: Mapping[str, float]) -> None:
         """Notes the time that this process took, and each phase's over all processes; and the peak memory so far."""
         peaks = peak_memory()
-        before = self.fields["peak_memory_bytes"]
+        before = self.fields.peak_memory_bytes
         self.update(
             wall_clock_seconds={**phases, "total": self.wall_seconds + seconds},
             peak_memory_bytes={name: max(peak, before.get(name, 0)) for name, peak in peaks.items()},
@@ -381,27 +379,17 @@ def _require_same_run(folder: Path, stored: Config, asked: Config) -> None:
             raise UserError(f"{folder} holds a run with {name}={old[name]}, not {new[name]}; choose another --out")
 
 
-def _require_same_rules(folder: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
-    for name, value in new.items():
-        if old.get(name) != value:
+def _require_same_rules(folder: Path, old: ProtocolFields, new: ProtocolFields) -> None:
+    for name, value in new:
+        before = getattr(old, name)
+        if before != value:
             raise UserError(
-                f"{folder} was started under {name}={old.get(name)}, not the present {value}; choose another --out"
+                f"{folder} was started under {name}={before}, not the present {value}; choose another --out"
             )
 
 
-def _read_fields(folder: Path) -> dict[str, Any]:
-    fields = _read_json(folder, "record.json")
-    if fields.get("schema") != SCHEMA:
-        raise UserError(f"{folder} has a record of schema {fields.get('schema')}; this version reads {SCHEMA}")
-    try:
-        RecordFields.model_validate(fields)
-    except ValidationError as error:
-        raise UserError(f"{folder}/record.json is damaged: {first_problem(error)}") from error
-    return fields
-
-
 def _read_config(folder: Path) -> Config:
-    fields = _read_json(folder, "config.json")
+    fields = read_json(folder, "config.json")
     try:
         return Config(**fields)
     except ValidationError as error:
@@ -410,26 +398,3 @@ def _read_config(folder: Path) -> Config:
 
 def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-
-
-def _write_json(path: Path, value: Any) -> None:
-    write_whole(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
-
-
-def _no_number(text: str) -> Any:
-    raise ValueError(f"{text} is not a number that JSON has")
-
-
-def _read_json(folder: Path, name: str) -> dict[str, Any]:
-    path = folder / name
-    try:
-        value = json.loads(path.read_text(), parse_constant=_no_number)
-    except FileNotFoundError:
-        raise UserError(f"{folder} is no run folder: it has no {name}") from None
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise UserError(f"{path} is damaged: {error}") from error
-    if not isinstance(value, dict):
-        raise UserError(f"{path} is damaged: not an object")
-    return value

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 from pydantic import (
@@ -11,10 +13,17 @@ from pydantic import (
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
+    ValidationError,
     field_validator,
 )
 
+from suite.config import hash_of
+from suite.errors import UserError
+from suite.overrides import first_problem
+from suite.tables import write_whole
+
 SCHEMA = 1
+FILE = "record.json"
 
 
 class _Part(BaseModel):
@@ -29,6 +38,11 @@ class ProtocolFields(_Part):
     final_fraction: PositiveFloat
     package: str
     package_version: str | None
+
+    @property
+    def hash(self) -> str:
+        """Stands beside results, so that equal rules are found at a glance."""
+        return hash_of(self.model_dump())
 
 
 class DeviceFields(_Part):
@@ -80,3 +94,57 @@ class RecordFields(_Part):
         if "total" not in seconds:
             raise ValueError("wall_clock_seconds has no total")
         return seconds
+
+    @classmethod
+    def read(cls, folder: Path) -> RecordFields:
+        """Those of a run's folder.
+
+        Raises:
+          UserError: it holds no run, or its record is damaged or of another schema.
+        """
+        fields = read_json(folder, FILE)
+        if fields.get("schema") != SCHEMA:
+            raise UserError(f"{folder} has a record of schema {fields.get('schema')}; this version reads {SCHEMA}")
+        try:
+            return cls.model_validate(fields)
+        except ValidationError as error:
+            raise UserError(f"{folder}/{FILE} is damaged: {first_problem(error)}") from error
+
+    def write(self, folder: Path) -> None:
+        """Puts them into a run's folder, all at once."""
+        write_json(folder / FILE, self.model_dump(by_alias=True))
+
+    def replaced(self, **changes: Any) -> RecordFields:
+        """The same with other values for some fields, checked like those of a file."""
+        if unknown := changes.keys() - type(self).model_fields.keys():
+            raise ValueError(f"{FILE} has no field {', '.join(sorted(unknown))}")
+        return type(self).model_validate(self.model_dump(by_alias=True) | changes)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes numbers that JSON has, all at once."""
+    write_whole(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def read_json(folder: Path, name: str) -> dict[str, Any]:
+    """An object of a run's folder.
+
+    Raises:
+      UserError: the file is not there, cannot be read, or holds something else.
+    """
+    path = folder / name
+    try:
+        value = json.loads(path.read_text(), parse_constant=_no_number)
+    except FileNotFoundError:
+        raise UserError(f"{folder} is no run folder: it has no {name}") from None
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    except ValueError as error:
+        raise UserError(f"{path} is damaged: {error}") from error
+    if not isinstance(value, dict):
+        raise UserError(f"{path} is damaged: not an object")
+    return value
+
+
+def _no_number(text: str) -> Any:
+    raise ValueError(f"{text} is not a number that JSON has")

@@ -63,17 +63,17 @@ def test_folder_and_files(tmp_path):
 
 def test_the_protocol_hash_tells_comparable_results_apart(tmp_path):
     with create(tmp_path / "a") as one, create(tmp_path / "b", OTHER) as two:
-        assert one.fields["protocol_hash"] == two.fields["protocol_hash"]
-        assert one.fields["config_digest"] != two.fields["config_digest"]
+        assert one.fields.protocol_hash == two.fields.protocol_hash
+        assert one.fields.config_digest != two.fields.config_digest
     longer = resolve("craftax_classic", "m5", "smoke", steps=128)
     with create(tmp_path / "c", longer) as three:
-        assert three.fields["protocol_hash"] != one.fields["protocol_hash"]
+        assert three.fields.protocol_hash != one.fields.protocol_hash
 
 
 def test_replaying_after_a_rewind_writes_the_same_bytes_and_loses_nothing(tmp_path):
     with create(tmp_path / "whole") as record:
         assert record.rewind(0) == 0
-        assert record.fields["resumed"] == []  # that was the start
+        assert record.fields.resumed == []  # that was the start
         play(record, range(10, 60, 10))
     whole = contents(record.folder)
     with create(tmp_path / "stopped") as record:
@@ -84,7 +84,7 @@ def test_replaying_after_a_rewind_writes_the_same_bytes_and_loses_nothing(tmp_pa
         assert record.steps == 20
         play(record, range(30, 60, 10))
     assert contents(record.folder) == whole
-    assert [entry["step"] for entry in record.fields["resumed"]] == [20]
+    assert [entry["step"] for entry in record.fields.resumed] == [20]
     aside = record.folder / "replaced" / "0001_after_step_20"
     for name in ("episodes", "metrics", "timing"):
         header, *rows = before[name].splitlines(keepends=True)
@@ -156,8 +156,8 @@ def test_wall_clock_adds_up_over_processes(tmp_path):
         record.add_wall_clock(2.0, {"collect": 1.5})
     with RunRecord.open(record.folder, CONFIG) as record:
         record.add_wall_clock(3.0, {"collect": 4.0})
-    assert record.fields["wall_clock_seconds"] == {"collect": 4.0, "total": 5.0}
-    assert record.fields["peak_memory_bytes"]["process"] > 2**20
+    assert record.fields.wall_clock_seconds == {"collect": 4.0, "total": 5.0}
+    assert record.fields.peak_memory_bytes["process"] > 2**20
 
 
 # Bad input.
@@ -197,7 +197,7 @@ def test_a_record_of_another_configuration_is_refused(tmp_path):
 
 def test_a_record_of_other_rules_is_refused(tmp_path):
     with create(tmp_path) as record:
-        record.update(protocol=record.fields["protocol"] | {"package_version": "0.1"})
+        record.update(protocol=record.fields.protocol.model_dump() | {"package_version": "0.1"})
     with pytest.raises(UserError, match=r"package_version=0\.1, not the present"):
         RunRecord.open_or_create(record.folder, CONFIG, CORRIDOR_SPEC)
 
