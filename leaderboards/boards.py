@@ -140,7 +140,7 @@ def _rows(standing: Standing) -> Rows:
         "seeds": len(entry.seeds),
         "seed_list": ranges(entry.seeds),
         "steps": rules.steps,
-        "observation": _sees(entry),
+        "observation": sees(entry),
         "environment": rules.package,
         "environment_version": rules.package_version,
         "protocol": entry.protocol_hash,
@@ -173,7 +173,7 @@ def _family_rows(group: Sequence[FamilyScores]) -> Rows:
             "seeds": min(len(entry.seeds) for entry in scores.entries),
             "seed_list": ranges(set.intersection(*(set(entry.seeds) for entry in scores.entries))),
             "steps": rules.steps,
-            "observation": _sees(first),
+            "observation": sees(first),
             "environment": rules.package,
             "environment_version": rules.package_version,
             "minutes": float(sum(entry.minutes.mean() for entry in scores.entries)),
@@ -209,7 +209,8 @@ def _note(agent: str) -> str | None:
     return USES_SIMULATOR if agent in known and known[agent].uses_simulator else None
 
 
-def _sees(entry: Entry) -> str:
+def sees(entry: Entry) -> str:
+    """What its task shows: "pixels" or "symbolic"."""
     return "pixels" if entry.spec.observation.kind == "pixels" else "symbolic"
 
 

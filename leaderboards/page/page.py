@@ -13,7 +13,7 @@ import jinja2
 import markupsafe
 import pandas as pd
 
-from leaderboards.boards import IMPROVEMENT, OVERALL, as_csv, tables_digest
+from leaderboards.boards import IMPROVEMENT, OVERALL, as_csv, sees, tables_digest
 from leaderboards.families import GAMES, families
 from leaderboards.page import plots
 from leaderboards.publish import PAGE
@@ -96,7 +96,8 @@ def write_page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame], fol
       UserError: the folder cannot be written.
     """
     require_writable(folder)
-    sections = [_section(name, table, entries) for name, table in tables.items() if len(table)]
+    everything = pd.concat([table for table in tables.values() if len(table)], ignore_index=True)
+    sections = [_section(name, table, entries, everything) for name, table in tables.items() if len(table)]
     budgets = sorted({int(steps) for table in tables.values() for steps in table["steps"].dropna()})
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(HERE), autoescape=True, undefined=jinja2.StrictUndefined
@@ -129,7 +130,8 @@ def _classes_for_styles(html: str) -> str:
     return html.replace("</style>", f"{rules}</style>", 1)
 
 
-def _section(name: str, table: pd.DataFrame, entries: Sequence[Entry]) -> dict[str, Any]:
+def _section(name: str, table: pd.DataFrame, entries: Sequence[Entry], everything: pd.DataFrame) -> dict[str, Any]:
+    """`everything`: all tables' rows, as a family's picture shows what was published of its games."""
     id = name.removesuffix(".csv")
     overall = name == OVERALL
     task = "" if overall else str(table["task"].iloc[0])
@@ -147,7 +149,7 @@ def _section(name: str, table: pd.DataFrame, entries: Sequence[Entry]) -> dict[s
             {"title": _heading(str(family), part), "rows": list(_rows(part, metrics or _shown(part["metric"], pad=2)))}
             for family, part in parts
         ],
-        "lead": [_with_own_ids(figure, id) for figure in _stories(own, table)],
+        "lead": [_with_own_ids(figure, id) for figure in _stories(own, everything)],
         "more": [
             _with_own_ids(figure, id) for figure in (_family_figures(entries) if overall else _figures(own, table))
         ],
@@ -359,8 +361,7 @@ def _figure(svg: str, caption: str, of: Entry | None = None) -> dict[str, Any]:
     """`of`: whose task and budget it belongs to, by which it is filtered."""
     facts = {}
     if of is not None:
-        seen = "pixels" if of.spec.observation.kind == "pixels" else "symbolic"
-        facts = {"origin": "ours", "observation": seen, "steps": of.config.protocol.steps}
+        facts = {"origin": "ours", "observation": sees(of), "steps": of.config.protocol.steps}
     return {"svg": svg, "caption": caption, "facts": facts}
 
 
