@@ -1,8 +1,6 @@
-"""Games as environments of the suite, and the suite's tasks in other libraries' interfaces.
+"""Games as environments of the suite, one folder or file for each family.
 
-Importing this package tells Gymnasium of every single-agent task; it builds no game and imports no JAX.
+Two of the folders also go the other way: the suite's tasks as Gymnasium's and PettingZoo's environments.
+
+They import the interface and the registry's entries, and know no agent.
 """
-
-from adapters.gymnasium_export import register_all
-
-register_all()

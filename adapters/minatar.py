@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 
 from adapters.numerics import like, loose_numerics, strong
-from suite.errors import UserError, did_you_mean
 from suite.interface.environment import Environment, EnvironmentSpec, ObservationSpec, TimeStep
+from suite.runtime.errors import UserError, did_you_mean
 
 SIDE, PATCH = 10, 2
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from baselines import ladder
-from suite.config import Config
-from suite.overrides import apply_changes
+from suite.configuration.overrides import apply_changes
+from suite.configuration.schema import Config
 
 
 def m5_patch5(config: Config) -> Config:

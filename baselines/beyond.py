@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from suite.config import Config
-from suite.overrides import apply_changes
+from suite.configuration.overrides import apply_changes
+from suite.configuration.schema import Config
 
 Part = Callable[[Config], dict[str, Any]]
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from suite.config import Config
-from suite.overrides import apply_changes
+from suite.configuration.overrides import apply_changes
+from suite.configuration.schema import Config
 
 VQ_CODES = 512  # "methods M1-3 use a codebook size of 512"
 
@@ -35,7 +35,7 @@ def m4(config: Config) -> Config:
 def m5(config: Config) -> Config:
     """M5, M4 + BTF, best MBRL (fast): 67.42 +- 0.55 % reward, 27.91 +- 0.63 % score, 58.5M parameters.
 
-    The defaults of `suite.config`.
+    The defaults of `suite.configuration.schema`.
     """
     return config
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from suite.config import Config
-from suite.overrides import apply_changes
+from suite.configuration.overrides import apply_changes
+from suite.configuration.schema import Config
 
 
 def paper(config: Config) -> Config:
@@ -303,7 +303,7 @@ def openspiel_smoke(config: Config) -> Config:
 def _without_needless_memory(config: Config) -> Config:
     observed = FULLY_OBSERVED.get(config.task)
     if observed is None:
-        from adapters.openspiel import fully_observed
+        from adapters.openspiel.task import fully_observed
 
         observed = fully_observed(config.task.partition("/")[2])
     return apply_changes(config, {"policy.rnn_size": 0}) if observed else config

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from suite.config import Config
-from suite.overrides import apply_changes
+from suite.configuration.overrides import apply_changes
+from suite.configuration.schema import Config
 
 
 def random(config: Config) -> Config:

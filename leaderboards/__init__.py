@@ -1,0 +1,1 @@
+"""Published results: scores, statistics, boards as CSV files, and the page."""

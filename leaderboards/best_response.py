@@ -1,6 +1,6 @@
 """What a two-player game's return is worth: exact values on the game's tables, in NumPy.
 
-Shapes: N nodes (K chance's, then D players', then ends) and A actions as in `adapters.game_tables`; M nodes of one
+Shapes: N nodes (K chance's, then D players', then ends) and A actions as in `adapters.openspiel.tables`; M nodes of one
 level, G information sets.
 """
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:  # scoring needs `REFERENCE` only, and no adapter
-    from adapters.game_tables import Tables
+    from adapters.openspiel.tables import Tables
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,8 +11,8 @@ import pandas as pd
 from leaderboards.results import Entry, entries_of
 from leaderboards.scoring import main_score
 from leaderboards.statistics import mean_and_standard_error
-from suite.errors import UserError, did_you_mean
-from suite.record import RunRecord
+from suite.records.record import RunRecord
+from suite.runtime.errors import UserError, did_you_mean
 
 Spread = tuple[float, float]  # mean and standard error; nan where there is none
 

@@ -17,10 +17,10 @@ import pandas as pd
 from leaderboards.boards import Standing, as_csv, boards, tables_digest
 from leaderboards.qualification import Refusal, evidence_files, examine, overrides, settings
 from leaderboards.results import Entry, entries_of, run_folders
-from suite.config import hash_of
-from suite.errors import UserError
-from suite.record import RunRecord, require_writable
-from suite.tables import write_whole
+from suite.configuration.schema import hash_of
+from suite.records.record import RunRecord, require_writable
+from suite.records.tables import write_whole
+from suite.runtime.errors import UserError
 
 PAGE = "index.html"
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pandas as pd
 
 from suite import registry
-from suite.errors import UserError, did_you_mean
+from suite.runtime.errors import UserError, did_you_mean
 
 PATH = Path(__file__).with_name("published.csv")
 COLUMNS = (

@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 
 from suite import registry
-from suite.config import Config, hash_of
-from suite.errors import UserError
-from suite.overrides import dotted
-from suite.record import RunRecord, episode_columns, protocol
+from suite.configuration.overrides import dotted
+from suite.configuration.schema import Config, hash_of
+from suite.records.record import RunRecord, episode_columns, protocol
+from suite.runtime.errors import UserError
 
 # What a result may differ in without being another agent's: when it is saved and evaluated, and what numbers the
 # device computes in, which "auto" decides (`suite.registry`).

@@ -12,10 +12,10 @@ import numpy as np
 from leaderboards.qualification import settings
 from leaderboards.scoring import main_score
 from suite import registry
-from suite.config import Config, hash_of
-from suite.errors import UserError
+from suite.configuration.schema import Config, hash_of
 from suite.interface.environment import EnvironmentSpec
-from suite.record import RunRecord
+from suite.records.record import RunRecord
+from suite.runtime.errors import UserError
 
 COUNTS = frozenset({"episodes", "final_episodes"})
 

@@ -14,7 +14,7 @@ import pandas as pd
 from leaderboards.best_response import REFERENCE, normalized
 
 if TYPE_CHECKING:
-    from suite.config import Config
+    from suite.configuration.schema import Config
     from suite.interface.environment import EnvironmentSpec
 
 

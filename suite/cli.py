@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn
 
-from suite.compilation import quiet_xla
-from suite.errors import RunError, UserError, did_you_mean, host_errors
+from suite.runtime.compilation import quiet_xla
+from suite.runtime.errors import RunError, UserError, did_you_mean, host_errors
 
 COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "compare", "sweep", "publish", "verify", "bench")
 BAD_INPUT, FAILED, STOPPED = 2, 1, 130

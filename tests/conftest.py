@@ -21,7 +21,7 @@ jax.config.update("jax_default_matmul_precision", "highest")
 @pytest.fixture(autouse=True, scope="session")
 def compilation_cache():
     """Compile each Craftax program once per machine, as users do."""
-    from suite.compilation import enable_compilation_cache
+    from suite.runtime.compilation import enable_compilation_cache
 
     enable_compilation_cache()
 
@@ -38,20 +38,21 @@ def drop_compiled_programs():
 HASTY = (
     "agent",
     "baselines",
+    "benchmarks",
     "diagnostics",
     "interface",
+    "nn",
     "policy",
+    "runs/test_training.py",
     "tokenizers",
     "world_model",
-    "test_bench.py",
-    "test_run.py",
 )
 
 
 @pytest.fixture(autouse=True, scope="module")
 def hasty_compilation(request):
     """Compiles the programs of a module below `HASTY` without most optimizations, in half of the time."""
-    hasty = request.path.relative_to(Path(__file__).parent).parts[0] in HASTY
+    hasty = request.path.relative_to(Path(__file__).parent).as_posix().startswith(HASTY)
     jax.config.update("jax_disable_most_optimizations", hasty)
     yield
     jax.config.update("jax_disable_most_optimizations", False)

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from adapters import openspiel
-from adapters.game_tables import Tables
+from adapters.openspiel.tables import Tables
+from adapters.openspiel.task import task as openspiel
 from suite.interface.batching import Batched
 from suite.interface.turns import choose_event
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from suite.config import Config
+from suite.configuration.overrides import apply_changes
+from suite.configuration.schema import Config
 from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
 from suite.interface.turns import Turn
-from suite.overrides import apply_changes
 from suite.registry import Lazy, TaskEntry
 
 CORRIDOR_SPEC = EnvironmentSpec(

@@ -22,8 +22,8 @@ from leaderboards.qualification import overrides
 from leaderboards.results import Entry
 from leaderboards.scoring import main_score
 from suite import registry
-from suite.record import require_writable
-from suite.tables import write_whole
+from suite.records.record import require_writable
+from suite.records.tables import write_whole
 
 HERE = Path(__file__).parent
 BARS = 4  # agents beside each other in a bar chart, at most

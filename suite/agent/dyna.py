@@ -18,8 +18,7 @@ from flax import nnx, struct
 
 from suite.agent import rollout as play
 from suite.agent.replay import Experience, Replay, ReplayState
-from suite.config import Config
-from suite.errors import UserError
+from suite.configuration.schema import Config
 from suite.interface.batching import Batched
 from suite.interface.environment import BatchedEnvironment, Environment, EnvironmentSpec, State
 from suite.interface.host import HostEnvironment
@@ -27,6 +26,7 @@ from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec, encode_
 from suite.interface.turns import Turn, stream_action
 from suite.policy import ppo
 from suite.policy.actor_critic import make_policy
+from suite.runtime.errors import UserError
 from suite.tokenizers import make_tokenizer
 from suite.world_model import training as world_model_training
 from suite.world_model.ages import ages_of

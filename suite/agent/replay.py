@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from suite.config import Config
+from suite.configuration.schema import Config
 from suite.interface.environment import EnvironmentSpec, State
 from suite.interface.turns import Turn
 from suite.policy.ppo import Trajectory

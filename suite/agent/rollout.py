@@ -193,7 +193,7 @@ def rollout(
         last_ours_B=None if player.time_step.turn is None else player.time_step.turn.ours,
     )
     if burn_in := start_recent.first_MB.shape[0]:
-        since = length - burn_in  # not negative: suite.config sees to it
+        since = length - burn_in  # not negative: suite.configuration.schema sees to it
         recent = Recent(
             observation_MB=trajectory.observation_TB[since:],
             first_MB=trajectory.first_TB[since:],

@@ -24,11 +24,11 @@ def execute(args: argparse.Namespace) -> int:
 
     config = registry.resolve(args.task, args.agent, args.preset, args.overrides, 0, args.steps)
 
-    from suite import bench
+    from suite.benchmarks import phases
 
     if not args.quiet:
         print(f"{config.task}, agent {config.agent}, preset {config.preset}, on {device_name()}", flush=True)
-    measured = bench.bench(config, make_reporter(args.quiet), start_up=not args.no_start_up)
+    measured = phases.bench(config, make_reporter(args.quiet), start_up=not args.no_start_up)
     parts = measured if isinstance(measured, Mapping) else {"phases": measured}
     for name, part in parts.items():
         if isinstance(part, list):

@@ -7,7 +7,7 @@ import dataclasses
 from pathlib import Path
 
 from suite.commands.printing import print_json
-from suite.errors import UserError
+from suite.runtime.errors import UserError
 
 SUMMARY = "finished runs: scores and curves, mean and standard error over seeds, as Markdown tables"
 

@@ -18,8 +18,8 @@ def execute(args: argparse.Namespace) -> int:
 
     layers = registry.layers(args.task, args.agent, args.preset, args.overrides, 0, args.steps)
 
-    from suite.describe import describe
-    from suite.saved_model import agent_for
+    from suite.diagnostics.describe import describe
+    from suite.runs.saved_model import agent_for
 
     config, state = layers[-1][1], None
     if config.imagination.world == "game":  # only then is the game itself looked at

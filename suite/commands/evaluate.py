@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from suite.commands.printing import make_reporter, print_json, print_scores
-from suite.errors import UserError
+from suite.runtime.errors import UserError
 
 SUMMARY = "play whole episodes with a run's newest checkpoint"
 
@@ -20,12 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from suite import registry
-    from suite.record import RunRecord
+    from suite.records.record import RunRecord
 
     if args.episodes is not None and args.episodes < 1:
         raise UserError(f"--episodes={args.episodes}: must be at least 1")
     if args.policy:
-        from suite.external import evaluate_policy
+        from suite.runs.external import evaluate_policy
 
         scores = evaluate_policy(args.what, args.policy, args.episodes, make_reporter(args.quiet))
         print_scores(scores)
@@ -37,7 +37,7 @@ def execute(args: argparse.Namespace) -> int:
         raise UserError(f"{args.what} is a task: say whose policy to play it with, --policy module:Class")
     RunRecord.open(folder, lock=False)
 
-    from suite import evaluation
+    from suite.runs import evaluation
 
     scores = evaluation.evaluate(folder, args.episodes, make_reporter(args.quiet))
     print_scores(scores)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from suite.commands.printing import format_value, make_reporter, print_json, print_table
-from suite.errors import UserError
+from suite.runtime.errors import UserError
 
 SUMMARY = "how good world models are: rollouts beside reality; of games, whether they keep the rules"
 
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from suite.record import RunRecord
+    from suite.records.record import RunRecord
 
     if args.games < 1:
         raise UserError(f"--games={args.games}: must be at least 1")

@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from suite.commands.printing import print_json, print_table
-from suite.errors import UserError, did_you_mean
+from suite.runtime.errors import UserError, did_you_mean
 
 SUMMARY = "tasks, agents or presets, one line each"
 LISTS = ("tasks", "agents", "presets")

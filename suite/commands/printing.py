@@ -10,12 +10,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from suite.reporting import Reporter
+    from suite.runtime.reporting import Reporter
 
 
 def make_reporter(quiet: bool) -> Reporter:
     """Progress on stderr, or warnings only."""
-    from suite.reporting import QuietReporter, RichReporter
+    from suite.runtime.reporting import QuietReporter, RichReporter
 
     return QuietReporter() if quiet else RichReporter()
 

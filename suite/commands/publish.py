@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from suite.commands.printing import print_json
-from suite.errors import UserError
+from suite.runtime.errors import UserError
 
 SUMMARY = "check finished runs, keep their evidence, and write leaderboards (CSV) and a page of them"
 RUNS = Path("runs")

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from suite.commands.configuration import add_configuration, parse_seeds
 from suite.commands.printing import device_name, make_reporter, print_json, print_scores, score_line
-from suite.errors import UserError
+from suite.runtime.errors import UserError
 
 if TYPE_CHECKING:
-    from suite.run import Result
+    from suite.runs.training import Result
 
 SUMMARY = "train an agent on a task, or go on where the same command stopped"
 STOPPED = 130
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from suite import registry
-    from suite.record import RunRecord, require_writable, run_folder
+    from suite.records.record import RunRecord, require_writable, run_folder
 
     seeds = args.seeds or [args.seed]
     configs = [registry.resolve(args.task, args.agent, args.preset, args.overrides, seed, args.steps) for seed in seeds]
@@ -43,14 +43,14 @@ def execute(args: argparse.Namespace) -> int:
         if exists:  # so that the last seed's folder is known to be right before the first one's run starts
             RunRecord.open(folder, config, lock=False)
 
-    from suite import run
+    from suite.runs import training
 
     results: list[Result] = []
     for folder, config, exists in zip(folders, configs, begun, strict=True):
         if not args.quiet:
             what = f"{config.task}, agent {config.agent}, preset {config.preset}, seed {config.seed}"
             print(f"{what}, on {device_name()}; files in {folder}", flush=True)
-        result = run.run(config, args.out, make_reporter(args.quiet), args.resume and exists)
+        result = training.run(config, args.out, make_reporter(args.quiet), args.resume and exists)
         results.append(result)
         _print_result(result)
         if result.status == "stopped":

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from suite.commands.configuration import parse_seeds
 from suite.commands.printing import print_json, print_table, score_line
-from suite.errors import UserError
+from suite.runtime.errors import UserError
 
 if TYPE_CHECKING:
     from rich.console import Console, Group
 
-    from suite.sweep import Handle, Run
+    from suite.runs.sweep import Handle, Run
 
 SUMMARY = "tasks x agents x seeds, side by side; the same command again does what is missing"
 FAILED, STOPPED = 1, 130
@@ -62,11 +62,11 @@ def execute(args: argparse.Namespace) -> int:
     if on_ray:
         _require_ray()
 
-    from suite import sweep
+    from suite.runs import sweep
 
     overrides, out = args.overrides, args.out
     if on_ray:  # whose workers are in other folders, and maybe on other kinds of machines
-        from suite.sweep_ray import compute_types
+        from suite.runs.sweep_ray import compute_types
 
         overrides, out = [*compute_types(args.gpus or 0), *overrides], out.absolute()
     runs = sweep.plan(args.tasks, args.agents, args.seeds, args.preset, overrides, args.steps, out)
@@ -94,14 +94,14 @@ def _require_ray() -> None:
 def _engine(args: argparse.Namespace) -> Iterator[tuple[Callable[[Run], Handle], int | None, str]]:
     """How to start a run, how many at once, and that in words."""
     if args.engine == "local":
-        from suite.sweep import Process, default_jobs, share_of_memory
+        from suite.runs.sweep import Process, default_jobs, share_of_memory
 
         jobs = args.jobs or default_jobs()
         environment = share_of_memory(1 / jobs)
         yield lambda run: Process(run.words, run.folder, args.retries, environment), jobs, f"{jobs} at once"
         return
 
-    from suite.sweep_ray import Cluster
+    from suite.runs.sweep_ray import Cluster
 
     cluster = Cluster(args.address, args.gpus or 0, args.jobs, args.retries)
     try:
@@ -202,7 +202,7 @@ def _counts(runs: Sequence[Run]) -> str:
 
 
 def _print_results(runs: Sequence[Run]) -> None:
-    from suite.sweep import log_of
+    from suite.runs.sweep import log_of
 
     print_table([COLUMNS, *map(_row, runs)])
     for run in runs:

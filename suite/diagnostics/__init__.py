@@ -1,0 +1,1 @@
+"""What `suite inspect` and `suite describe` show: world models beside reality, symbols, rules, sizes."""

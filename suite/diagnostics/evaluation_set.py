@@ -1,6 +1,6 @@
 """The evaluation set of Section 4.4: what the paper's best model-free agent saw and did while it learned.
 
-Built once per task, preset and package version, and kept in the user's cache folder (`suite.cache`).
+Built once per task, preset and package version, and kept in the user's cache folder (`suite.runtime.cache`).
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import numpy as np
 from suite import registry
 from suite.agent.algorithm import iterate, iteration_key, start_key
 from suite.agent.dyna import Agent
-from suite.cache import cache_dir
-from suite.compilation import enable_compilation_cache
-from suite.config import Config, hash_of
+from suite.configuration.schema import Config, hash_of
 from suite.interface.environment import Environment, EnvironmentSpec, State, TimeStep
-from suite.reporting import Reporter
-from suite.tables import write_whole
+from suite.records.tables import write_whole
+from suite.runtime.cache import cache_dir
+from suite.runtime.compilation import enable_compilation_cache
+from suite.runtime.reporting import Reporter
 
 COLLECTOR = "mfrl"
 TRAJECTORIES, STEPS = 160, 20  # N_eval, T_eval

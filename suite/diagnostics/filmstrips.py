@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 
 from suite.diagnostics.evaluation_set import EvaluationSet
 from suite.diagnostics.pictures import ALARM, INK, PAPER, as_rgb, enlarged, font
-from suite.tables import write_whole
+from suite.records.tables import write_whole
 from suite.tokenizers.patches import patch_grid
 from suite.world_model.training import SAME_PATCH
 

@@ -10,15 +10,15 @@ from typing import Any
 import jax
 import pandas as pd
 
-from suite import checkpoint
 from suite.diagnostics import evaluation_set, filmstrips, pictures, symbols
 from suite.diagnostics.evaluation_set import EvaluationSet
 from suite.diagnostics.rollouts import Rollouts, compare, imagine
-from suite.errors import UserError
-from suite.record import RunRecord, require_writable
-from suite.reporting import Reporter
-from suite.saved_model import no_checkpoint, restore
-from suite.tables import write_whole
+from suite.records import checkpoint
+from suite.records.record import RunRecord, require_writable
+from suite.records.tables import write_whole
+from suite.runs.saved_model import no_checkpoint, restore
+from suite.runtime.errors import UserError
+from suite.runtime.reporting import Reporter
 
 STRIPS = 4
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
 from suite.interface.tokens import Tokenizer, TokenizerState
-from suite.tables import write_whole
+from suite.records.tables import write_whole
 
 CODES, CODE_COLUMNS, CODE_SIDE, CAPTION = 128, 16, 56, 16  # codes in a picture; pixels
 INK, PAPER, ALARM = (20, 20, 20), (255, 255, 255), (255, 0, 160)

@@ -17,14 +17,14 @@ from flax import nnx, struct
 
 from suite.agent import rollout as play
 from suite.agent.dyna import Agent
-from suite.errors import UserError
 from suite.interface.environment import State, TimeStep
 from suite.interface.turns import CHANCE, Turn
 from suite.policy.actor_critic import UniformPolicy
 from suite.policy.ppo import Learner
-from suite.record import RunRecord
-from suite.reporting import QuietReporter, Reporter
-from suite.saved_model import restore
+from suite.records.record import RunRecord
+from suite.runs.saved_model import restore
+from suite.runtime.errors import UserError
+from suite.runtime.reporting import QuietReporter, Reporter
 
 GAMES = 1_000
 

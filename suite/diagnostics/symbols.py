@@ -17,7 +17,7 @@ from suite import registry
 from suite.diagnostics import evaluation_set
 from suite.diagnostics.evaluation_set import Pairs
 from suite.interface.environment import ObservationSpec
-from suite.reporting import Reporter
+from suite.runtime.reporting import Reporter
 from suite.tokenizers.patches import patch_grid, split_patches
 
 CHANNELS = 128

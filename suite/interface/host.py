@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from suite.errors import RunError
 from suite.interface.environment import EnvironmentSpec, TimeStep
 from suite.interface.turns import CHANCE, Turn
+from suite.runtime.errors import RunError
 
 LIMIT = 1000  # steps of an episode where an engine names no limit of its own
 FEW_REWARDS, MANY_INTEGERS = 3, 16  # up to so many rewards are their own classes; more share evenly spaced ones

@@ -1,0 +1,1 @@
+"""The actor-critic, its networks and PPO."""

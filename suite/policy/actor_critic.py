@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx, struct
 
-from suite.config import PolicyConfig
+from suite.configuration.schema import PolicyConfig
 from suite.interface.environment import ObservationSpec
 from suite.policy.moon import MoonCNN, MoonTrunk
 from suite.policy.networks import GRU, RELU_GAIN, DenseTrunk, ImpalaCNN, Norm, SymbolMLP, dense

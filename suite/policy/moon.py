@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from suite.config import PolicyConfig
+from suite.configuration.schema import PolicyConfig
 from suite.policy.networks import RELU_GAIN, Conv3x3, Norm, Projection, dense, max_pool
 
 FRAME = (1, 2, 3)  # height, width, channels: a group norm with one group

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from suite.config import PolicyConfig
-from suite.convolution import convolve
+from suite.configuration.schema import PolicyConfig
+from suite.nn.convolution import convolve
 
 Initializer = Callable[..., jax.Array]
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from flax import nnx, struct
 
-from suite.config import PPOConfig
+from suite.configuration.schema import PPOConfig
 from suite.interface.turns import Turn
 from suite.policy.actor_critic import PolicyOutput, log_probability, mask_logits
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from suite.config import TokenizerConfig
-from suite.errors import UserError
+from suite.configuration.schema import TokenizerConfig
 from suite.interface.environment import ObservationSpec
 from suite.interface.tokens import Tokenizer
+from suite.runtime.errors import UserError
 from suite.tokenizers.continuous import ContinuousTokenizer
 from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
 from suite.tokenizers.patches import patch_grid

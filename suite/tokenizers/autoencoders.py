@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from suite.convolution import convolve
+from suite.nn.convolution import convolve
 from suite.tokenizers.patches import join_patches, split_patches
 
 DOWNSAMPLED = (0, 2, 3)  # the first, third and fourth of five residual blocks

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import optax
 from flax import nnx, struct
 
-from suite.config import TokenizerConfig
+from suite.configuration.schema import TokenizerConfig
 from suite.interface.environment import ObservationSpec
 from suite.tokenizers.autoencoders import FrameDecoder, FrameEncoder, PatchDecoder, PatchEncoder, latent_grid
 from suite.tokenizers.patches import patch_grid

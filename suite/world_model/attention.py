@@ -12,7 +12,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from suite.world_model.dropout import dropout
+from suite.nn.dropout import dropout
 
 GROUPS = 10
 

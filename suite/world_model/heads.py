@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import nnx, struct
 from jax.typing import DTypeLike
 
-from suite.config import WorldModelConfig
+from suite.configuration.schema import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 
 NARROWER = 4  # so many times fewer numbers a symbol in `SymbolsHead` than in a token's hidden state

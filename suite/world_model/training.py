@@ -11,7 +11,7 @@ import optax
 from flax import nnx, struct
 from optax.contrib import MuonDimensionNumbers
 
-from suite.config import WorldModelConfig
+from suite.configuration.schema import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.interface.turns import CHANCE, Turn
 from suite.world_model.correspondence import mixture_loss

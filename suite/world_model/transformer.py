@@ -19,11 +19,11 @@ import numpy as np
 from flax import nnx, struct
 from jax.typing import DTypeLike
 
-from suite.config import WorldModelConfig
+from suite.configuration.schema import WorldModelConfig
 from suite.interface.tokens import TokenSpec
+from suite.nn.dropout import dropout
 from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
-from suite.world_model.dropout import dropout
 from suite.world_model.heads import Head, PlaceHead, SymbolsHead, TurnHead, TurnLogits, filled_odds
 
 TERMINATION_CLASSES = 2

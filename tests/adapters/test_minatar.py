@@ -13,7 +13,7 @@ import pytest
 from adapters.minatar import GAMES, MinAtar
 from adapters.numerics import loose_numerics
 from suite import registry
-from suite.errors import UserError
+from suite.runtime.errors import UserError
 
 EPISODES = {"asterix": 100, "breakout": 100, "freeway": 10, "seaquest": 100, "space_invaders": 100}
 # Freeway's are 2,500 steps each.

@@ -10,7 +10,7 @@ import pytest
 from flax import nnx
 
 from suite.agent import rollout as play
-from suite.config import PolicyConfig
+from suite.configuration.schema import PolicyConfig
 from suite.interface.batching import Batched
 from suite.policy.actor_critic import make_policy
 from suite.policy.ppo import TargetStatistics

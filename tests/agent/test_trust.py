@@ -11,8 +11,8 @@ import pytest
 
 from suite import registry
 from suite.agent.dyna import Agent
-from suite.errors import UserError
 from suite.interface.tokens import TokenSpec
+from suite.runtime.errors import UserError
 from suite.world_model.training import known_share, reward_frequency
 from tests.tiny import WIDE_CORRIDOR, WideCorridor
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from suite import registry, run
-from suite.reporting import QuietReporter
+from suite import registry
+from suite.runs import training
+from suite.runtime.reporting import QuietReporter
 from tests.tiny import WIDE_CORRIDOR
 
 # Of these each setting runs in another agent, and test_presets says which settings those are. What m6 lacks without one
@@ -30,7 +31,7 @@ def test_two_iterations(task, agent, tmp_path, monkeypatch):
     distrusts = (task, agent) == ("wide_corridor", "m6")
     overrides = ["imagination.trust=0", "imagination.trust_window=0"] if agent == "m6" and not distrusts else []
     config = registry.resolve(task, agent, "smoke", overrides)
-    result = run.run(config, tmp_path, QuietReporter())
+    result = training.run(config, tmp_path, QuietReporter())
     assert (result.status, result.steps) == ("finished", config.protocol.steps)
     metrics = pd.read_csv(result.folder / "metrics.csv")
     assert len(metrics) == 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from suite import registry
-from suite.overrides import dotted
+from suite.configuration.overrides import dotted
 
 # Table "MFRL hyperparameters"; sizes of layers are counted in test_describe.
 MFRL_TABLE = {

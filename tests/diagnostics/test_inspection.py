@@ -12,15 +12,16 @@ import pytest
 from flax import nnx
 from PIL import Image
 
-from suite import checkpoint, registry
+from suite import registry
 from suite.agent.dyna import Agent
 from suite.diagnostics import evaluation_set, inspection, rollouts, symbols
 from suite.diagnostics.evaluation_set import Pairs, WithSymbols
-from suite.errors import UserError
-from suite.record import RunRecord, run_folder
+from suite.records import checkpoint
+from suite.records.record import RunRecord, run_folder
 from suite.registry import Lazy
-from suite.reporting import QuietReporter
-from suite.saved_model import SavedModel, agent_for, restore
+from suite.runs.saved_model import SavedModel, agent_for, restore
+from suite.runtime.errors import UserError
+from suite.runtime.reporting import QuietReporter
 from suite.world_model.ages import ages_of
 from tests.tiny import CORRIDOR, PENNIES, Corridor
 
@@ -134,7 +135,7 @@ def test_the_extractor_learns(collected):
 
 
 def test_the_paper_s_network():
-    spec = registry.Lazy("adapters.craftax:CLASSIC_SPEC")().observation
+    spec = registry.Lazy("adapters.craftax.task:CLASSIC_SPEC")().observation
     network = symbols.nnx.eval_shape(lambda: symbols.Network(spec, 145, 17, symbols.nnx.Rngs(0)))
     assert network.first.kernel.shape == (7 * 7 * 3, 128) and network.second.kernel.shape == (128, 128)
     assert network.last.kernel.shape == (81 * 128, 2465)

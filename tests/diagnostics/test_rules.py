@@ -8,11 +8,12 @@ import jax
 import numpy as np
 import pytest
 
-from suite import registry, run
+from suite import registry
 from suite.diagnostics import rules
 from suite.diagnostics.rules import rules_kept, rules_of_run
-from suite.errors import UserError
-from suite.reporting import QuietReporter
+from suite.runs import training
+from suite.runtime.errors import UserError
+from suite.runtime.reporting import QuietReporter
 from tests.tiny import CORRIDOR, PENNIES
 from tests.world_model.test_games import learned
 
@@ -51,9 +52,9 @@ def test_chance_that_does_as_it_should_and_chance_that_does_not():
 
 def test_of_a_run(tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "TASKS", (CORRIDOR, PENNIES))
-    game = run.run(registry.resolve("pennies", "m5", "smoke"), tmp_path, QuietReporter())
+    game = training.run(registry.resolve("pennies", "m5", "smoke"), tmp_path, QuietReporter())
     kept = rules_of_run(game.folder, games=8)
     assert kept["agent"]["games"] == 8 and 0 <= kept["uniform"]["legal_percent"] <= 100
-    alone = run.run(registry.resolve("corridor", "random", "smoke"), tmp_path, QuietReporter())
+    alone = training.run(registry.resolve("corridor", "random", "smoke"), tmp_path, QuietReporter())
     with pytest.raises(UserError, match="has no world model of a two-player game"):
         rules_of_run(alone.folder)

@@ -9,9 +9,9 @@ import pytest
 from leaderboards.compare import compare, tables
 from leaderboards.results import finished_in
 from suite import cli
-from suite.errors import UserError
-from suite.record import RunRecord, run_folder
+from suite.records.record import RunRecord, run_folder
 from suite.registry import resolve, task
+from suite.runtime.errors import UserError
 
 SPEC = task("craftax_classic").spec()
 

@@ -13,8 +13,8 @@ import pytest
 
 from leaderboards.boards import COLUMNS
 from leaderboards.qualification import EVIDENCE
-from suite import record
-from suite.record import RunRecord, run_folder
+from suite.records import record
+from suite.records.record import RunRecord, run_folder
 from suite.registry import resolve, task
 
 TASK = "minatar/breakout"

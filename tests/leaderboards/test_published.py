@@ -10,8 +10,8 @@ import pytest
 
 from leaderboards.published import COLUMNS, OF_FAMILY, PATH, published
 from suite import registry
-from suite.catalog import AGENTS
-from suite.errors import UserError
+from suite.registry.catalog import AGENTS
+from suite.runtime.errors import UserError
 
 NUMBER = r"(?P<{0}>[\d.]+) \+- (?P<{0}_error>[\d.]+) %"
 PUBLISHED = [agent for agent in AGENTS if agent.published]

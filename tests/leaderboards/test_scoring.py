@@ -12,8 +12,8 @@ import pytest
 
 from leaderboards import scoring
 from leaderboards.best_response import Reference
-from suite.config import Config, EnvironmentConfig, PPOConfig, ProtocolConfig, ReplayConfig
-from suite.record import RunRecord
+from suite.configuration.schema import Config, EnvironmentConfig, PPOConfig, ProtocolConfig, ReplayConfig
+from suite.records.record import RunRecord
 from tests.tiny import CORRIDOR_SPEC
 
 SPEC = dataclasses.replace(CORRIDOR_SPEC, achievements=("wood", "iron"), achievement_rewards=(1.0, 1.0))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from suite.config import PolicyConfig
+from suite.configuration.schema import PolicyConfig
 from suite.interface.environment import ObservationSpec
 from suite.policy.actor_critic import (
     ActorCritic,

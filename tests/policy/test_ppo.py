@@ -12,7 +12,7 @@ import pytest
 from flax import nnx, struct
 
 from suite.agent import rollout as play
-from suite.config import PolicyConfig, PPOConfig
+from suite.configuration.schema import PolicyConfig, PPOConfig
 from suite.interface.batching import Batched
 from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
 from suite.interface.turns import Turn

@@ -40,7 +40,7 @@ def loop_encode(codes: list[np.ndarray], patches: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module")
 def craftax_frames() -> np.ndarray:
     """uint8 [steps, environments, 63, 63, 3] of random play."""
-    from adapters.craftax import make_classic
+    from adapters.craftax.task import make_classic
 
     environment = make_classic()
 

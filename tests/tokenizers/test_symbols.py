@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from suite.config import TokenizerConfig
+from suite.configuration.schema import TokenizerConfig
 from suite.interface.environment import ObservationSpec
 from suite.tokenizers import make_tokenizer
 from suite.tokenizers.symbols import SymbolTokenizer

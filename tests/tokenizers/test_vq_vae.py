@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from suite.config import TokenizerConfig
+from suite.configuration.schema import TokenizerConfig
 from suite.interface.environment import ObservationSpec
 from suite.tokenizers import make_tokenizer
 from suite.tokenizers.autoencoders import FrameDecoder, FrameEncoder

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from suite.config import WorldModelConfig
+from suite.configuration.schema import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.world_model.training import Sequences
 from suite.world_model.transformer import WorldModel

@@ -11,7 +11,7 @@ import pytest
 from flax import nnx
 
 from suite import registry
-from suite.errors import UserError
+from suite.runtime.errors import UserError
 from suite.world_model import training
 from suite.world_model.ages import ages_of, next_ages
 from suite.world_model.transformer import WorldModel

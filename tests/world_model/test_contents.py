@@ -11,8 +11,8 @@ import pytest
 from flax import nnx
 
 from suite import registry
-from suite.errors import UserError
 from suite.interface.environment import ObservationSpec
+from suite.runtime.errors import UserError
 from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
 from suite.world_model import training
 from suite.world_model.imagination import sample_one_by_one

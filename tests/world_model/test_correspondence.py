@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from suite.errors import UserError
 from suite.interface.tokens import TokenSpec
+from suite.runtime.errors import UserError
 from suite.world_model import training
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_loss, mixture_odds, neighbourhood
 from suite.world_model.imagination import draw

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from suite.config import WorldModelConfig
+from suite.configuration.schema import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import random_sequences, small_model

@@ -1,0 +1,400 @@
+"""The run record: one folder per run, from which every score can be recomputed. Nothing in it is ever overwritten.
+
+`runs/<task>/<agent>/<preset>/seed_<n>/` holds
+
+    config.json       the whole configuration
+    record.json       what ran where: task, agent, preset, seed, protocol, versions, device, times, status
+    episodes.csv      one row per real training episode
+    metrics.csv       one row per iteration
+    evaluations.csv   one row per evaluation episode; never mixed with training's
+    timing.csv        seconds per phase, one row per iteration
+    tensorboard/      the metrics as curves
+    checkpoints/      see `suite.records.checkpoint`
+    replaced/         rows of iterations that a resumed run played again
+
+No clock enters episodes.csv and metrics.csv, so that a run that was stopped and resumed writes the same bytes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import errno
+import fcntl
+import os
+import platform
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from suite import registry
+from suite.configuration.overrides import dotted, first_problem
+from suite.configuration.schema import Config
+from suite.records.provenance import package_version, peak_memory, surroundings
+from suite.records.schema import SCHEMA, ProtocolFields, RecordFields, read_json, write_json
+from suite.records.tables import Table
+from suite.runtime.errors import RunError, UserError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from suite.interface.environment import EnvironmentSpec
+
+LOCK = "run.lock"
+
+
+def run_folder(out: Path, config: Config) -> Path:
+    """Where a run's record lies under `out`."""
+    return out / config.task / config.agent / config.preset / f"seed_{config.seed}"
+
+
+def require_writable(folder: Path) -> None:
+    """Creates `folder` if it is not there.
+
+    Raises:
+      UserError: it cannot be created or written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".writable.{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
+
+
+@contextlib.contextmanager
+def disk_full_is_an_error() -> Iterator[None]:
+    """Turns a full disk, wherever inside it is noticed, into a `RunError`."""
+    try:
+        yield
+    except Exception as error:
+        if not _says_disk_full(error):
+            raise
+        raise RunError(
+            "disk full; the last checkpoint is intact: free some space and run the same command again"
+        ) from error
+
+
+def _says_disk_full(error: BaseException | None) -> bool:
+    """Also where a library wraps the system's error, or only quotes it."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        if os.strerror(errno.ENOSPC) in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def protocol(config: Config, spec: EnvironmentSpec) -> ProtocolFields:
+    """What must be equal for two results to be compared: budget, scoring, task, and the version of its rules."""
+    return ProtocolFields(
+        task=config.task,
+        steps=config.protocol.steps,
+        final_fraction=config.protocol.final_fraction,
+        package=spec.package,
+        package_version=package_version(spec.package) if spec.package else "",
+    )
+
+
+def episode_columns(spec: EnvironmentSpec) -> list[str]:
+    """Of episodes.csv and evaluations.csv."""
+    scalars = [name for name, shape in spec.statistics if shape == ()]
+    return ["step", "return", "length", *scalars, *spec.achievements]
+
+
+class RunRecord:
+    """A run's folder, open. At most one process has it open for writing.
+
+    Attributes:
+      folder: where it lies.
+      config: the run's configuration.
+      fields: the content of record.json.
+    """
+
+    def __init__(
+        self, folder: Path, config: Config, fields: RecordFields, spec: EnvironmentSpec | None, lock: IO[str] | None
+    ):
+        """Use `create`, `open` or `open_or_create`."""
+        self.folder, self.config, self.fields, self._lock = folder, config, fields, lock
+        self._spec = spec
+        self._tables = {
+            name: Table(folder / f"{name}.csv", columns) for name, columns in fields.columns.items() if lock
+        }
+        self._events: Any = None
+        self._purge_step: int | None = None
+        self._new = False
+
+    @classmethod
+    def create(cls, folder: Path, config: Config, spec: EnvironmentSpec) -> RunRecord:
+        """Starts the record of a new run.
+
+        Raises:
+          UserError: the folder cannot be written, is in use, or holds a run already.
+        """
+        require_writable(folder)
+        lock = _acquire(folder)
+        taken = [path for path in (folder / "record.json", *folder.glob("*.csv")) if path.exists()]
+        if taken:
+            lock.close()
+            raise UserError(f"{folder} already holds {taken[0].name}; choose another --out")
+        rules = protocol(config, spec)
+        fields = RecordFields(
+            schema=SCHEMA,
+            task=config.task,
+            agent=config.agent,
+            preset=config.preset,
+            seed=config.seed,
+            config_digest=config.digest(),
+            protocol=rules,
+            protocol_hash=rules.hash,
+            max_return=spec.max_return,
+            achievements=list(spec.achievements),
+            columns={
+                "episodes": episode_columns(spec),
+                "evaluations": episode_columns(spec),
+                "metrics": None,  # those of the first row
+                "timing": None,
+            },
+            status="running",
+            steps=0,
+            started=_now(),
+            ended=None,
+            wall_clock_seconds={"total": 0.0},
+            peak_memory_bytes={},
+            **surroundings(),
+            resumed=[],
+        )
+        write_json(folder / "config.json", config.as_dict())
+        fields.write(folder)  # last: a folder is a run from here on
+        record = cls(folder, config, fields, spec, lock)
+        record._new = True
+        return record
+
+    @classmethod
+    def open(
+        cls, folder: Path, config: Config | None = None, spec: EnvironmentSpec | None = None, lock: bool = True
+    ) -> RunRecord:
+        """Opens an existing record.
+
+        Args:
+          folder: the run's folder.
+          config: what the run is expected to be; None: whatever it is.
+          spec: the task's, to compare the protocol with; None: not compared.
+          lock: for writing; without it, only for reading.
+
+        Raises:
+          UserError: no run folder, another schema, damaged, another run than expected, or in use.
+        """
+        RecordFields.read(folder)  # nothing, not even a lock, is written into a folder that holds no run
+        held = _acquire(folder) if lock else None
+        try:
+            fields = RecordFields.read(folder)
+            stored = _read_config(folder)
+            if config is not None:
+                _require_same_run(folder, stored, config)
+            if config is not None and spec is not None:
+                _require_same_rules(folder, fields.protocol, protocol(config, spec))
+            return cls(folder, config or stored, fields, spec, held)
+        except BaseException:
+            if held is not None:
+                held.close()
+            raise
+
+    @classmethod
+    def open_or_create(cls, folder: Path, config: Config, spec: EnvironmentSpec) -> RunRecord:
+        """The record of this very run, begun or new; errors as `open` and `create`."""
+        if (folder / "record.json").exists():
+            return cls.open(folder, config, spec)
+        return cls.create(folder, config, spec)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run took all its steps."""
+        return self.fields.status == "finished"
+
+    @property
+    def steps(self) -> int:
+        """Real environment steps recorded so far."""
+        return self.fields.steps
+
+    @property
+    def wall_seconds(self) -> float:
+        """Seconds that the run took, over all processes that worked on it."""
+        return self.fields.wall_clock_seconds["total"]
+
+    @property
+    def spec(self) -> EnvironmentSpec:
+        """The task's specification."""
+        return self._spec or registry.task(self.config.task).spec()
+
+    def append_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Adds training episodes, in the order in which they ended.
+
+        Each row has `step` (real steps of the run when it ended), `return`, `length`, the task's scalar statistics,
+        and 0 or 1 for each achievement, all by name.
+        """
+        self._append("episodes", rows)
+
+    def append_evaluation(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Adds evaluation episodes: as `append_episodes`, `step` being that of the checkpoint."""
+        self._append("evaluations", rows)
+
+    def has_evaluation(self, step: int) -> bool:
+        """Whether there are evaluation episodes of the checkpoint at `step`."""
+        return any(row.startswith(f"{step},") for row in (self.folder / "evaluations.csv").read_text().splitlines())
+
+    def append_metrics(self, row: Mapping[str, Any], names: Iterable[str] = ()) -> None:
+        """Adds one iteration's metrics, `step` first.
+
+        The first row fixes the columns: its own and `names`, those that later rows may have. What a row lacks, or
+        has as None, stays empty.
+        """
+        from suite.records.event_files import EventFile
+
+        self._append("metrics", [row], names)
+        self.fields.steps = int(row["step"])
+        if self._events is None:
+            self._events = EventFile(self.folder / "tensorboard", self._purge_step)
+        numbers = {name: float(value) for name, value in row.items() if value is not None and name != "step"}
+        self._events.append(int(row["step"]), numbers)
+
+    def append_timing(self, row: Mapping[str, Any]) -> None:
+        """Adds one iteration's seconds per phase, `step` first. The first row fixes the columns."""
+        self._append("timing", [row])
+
+    def _append(self, table: str, rows: Iterable[Mapping[str, Any]], names: Iterable[str] = ()) -> None:
+        self._require_own_folder()
+        self._tables[table].append(rows, names)
+
+    def _require_own_folder(self) -> None:
+        """Raises a RunError if the folder was removed, or made anew by another run: rows of the two would mix."""
+        assert self._lock is not None, "opened for reading only"
+        held = os.fstat(self._lock.fileno())
+        try:
+            found = (self.folder / LOCK).stat()
+        except OSError:
+            found = None
+        if found is None or (held.st_dev, held.st_ino) != (found.st_dev, found.st_ino):
+            raise RunError(f"{self.folder} was removed or replaced while this run was writing into it")
+
+    def rewind(self, step: int) -> int:
+        """Goes back to a checkpoint: rows beyond `step` move to `replaced/`. Returns how many did.
+
+        The run plays those steps again, identically. What TensorBoard shows of them is replaced as well.
+        """
+        folders = self.folder / "replaced"
+        number = 1 + sum(1 for _ in folders.glob("*"))
+        aside = folders / f"{number:04d}_after_step_{step}"
+        moved = 0
+        for name, columns in self.fields.columns.items():
+            moved += self._tables[name].rewind(step, aside / f"{name}.csv")
+            self._tables[name] = Table(self.folder / f"{name}.csv", columns)
+        if not self._new:  # a run that has only just begun is not resumed
+            self._purge_step = step + 1
+            resumed = {"step": step, "date": _now(), **surroundings()}
+            self.update(steps=step, resumed=[*self.fields.resumed, resumed])
+        return moved
+
+    def update(self, **fields: Any) -> None:
+        """Replaces fields of record.json."""
+        replaced = self.fields.replaced(**fields)
+        self._require_own_folder()
+        self.fields = replaced
+        self.fields.write(self.folder)
+
+    def add_wall_clock(self, seconds: float, phases: Mapping[str, float]) -> None:
+        """Notes the time that this process took, and each phase's over all processes; and the peak memory so far."""
+        peaks = peak_memory()
+        before = self.fields.peak_memory_bytes
+        self.update(
+            wall_clock_seconds={**phases, "total": self.wall_seconds + seconds},
+            peak_memory_bytes={name: max(peak, before.get(name, 0)) for name, peak in peaks.items()},
+        )
+
+    def finish(self, steps: int) -> None:
+        """Marks the run as finished."""
+        self.update(status="finished", steps=steps, ended=_now())
+
+    def episodes(self) -> pd.DataFrame:
+        """The training episodes; see `leaderboards.scoring`."""
+        return self.table("episodes")
+
+    def table(self, name: str) -> pd.DataFrame:
+        """One of the CSV files, by its name without the ending.
+
+        Raises:
+          UserError: it cannot be read.
+        """
+        import pandas as pd
+
+        path = self.folder / f"{name}.csv"
+        try:
+            return pd.read_csv(path)
+        except (OSError, ValueError) as error:
+            raise UserError(f"cannot read {path}: {error}") from error
+
+    def close(self) -> None:
+        """Lets other processes open the folder."""
+        if self._events is not None:
+            self._events.close()
+            self._events = None
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def __enter__(self) -> RunRecord:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+def _acquire(folder: Path) -> IO[str]:
+    """The exclusive lock on a folder, held until the file is closed or its process ends, however it ends."""
+    try:
+        file = (folder / LOCK).open("a+")
+    except OSError as error:
+        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.seek(0)
+        owner = file.read().strip()
+        file.close()
+        raise UserError(f"{folder} is in use by another process ({owner or 'just started'})") from None
+    file.truncate(0)
+    file.write(f"pid {os.getpid()} on {platform.node()}")
+    file.flush()
+    return file
+
+
+def _require_same_run(folder: Path, stored: Config, asked: Config) -> None:
+    old, new = dotted(stored), dotted(asked)
+    for name in new:
+        if old[name] != new[name] and not name.startswith(("checkpoint.", "evaluation.")):
+            raise UserError(f"{folder} holds a run with {name}={old[name]}, not {new[name]}; choose another --out")
+
+
+def _require_same_rules(folder: Path, old: ProtocolFields, new: ProtocolFields) -> None:
+    for name, value in new:
+        before = getattr(old, name)
+        if before != value:
+            raise UserError(
+                f"{folder} was started under {name}={before}, not the present {value}; choose another --out"
+            )
+
+
+def _read_config(folder: Path) -> Config:
+    fields = read_json(folder, "config.json")
+    try:
+        return Config(**fields)
+    except ValidationError as error:
+        raise UserError(f"{folder}/config.json is not of this version: {first_problem(error)}") from error
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

@@ -1,0 +1,101 @@
+"""The model that a checkpoint keeps, and the way back from a run's folder to it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+from flax import struct
+
+from suite import registry
+from suite.agent.dyna import Agent, TrainState
+from suite.configuration.schema import CheckpointConfig, Config, EvaluationConfig
+from suite.interface.tokens import TokenizerState
+from suite.policy.ppo import Learner
+from suite.records import checkpoint
+from suite.records.record import RunRecord
+from suite.runtime.compilation import enable_compilation_cache
+from suite.runtime.errors import UserError
+from suite.runtime.reporting import Reporter
+
+
+@struct.dataclass
+class SavedModel:
+    """What evaluation and inspection need of a `TrainState`.
+
+    Attributes:
+      policy: the policy's parameters.
+      targets: statistics of its value targets.
+      tokenizer: codebook or networks; None for model-free agents.
+      world_model: the parameters that dreams use, averaged or not; None for model-free agents.
+    """
+
+    policy: Any
+    targets: Any
+    tokenizer: TokenizerState | None
+    world_model: Any
+
+    @classmethod
+    def of(cls, state: TrainState) -> SavedModel:
+        """The part of `state` that is saved as the model."""
+        learner, model = state.learner, state.world_model
+        return cls(learner.params, learner.targets, state.tokenizer, None if model is None else model.dreaming)
+
+    @property
+    def learner(self) -> Learner:
+        """The policy as it acts; it has no optimizer and cannot learn."""
+        return Learner(params=self.policy, optimizer=None, targets=self.targets)
+
+
+@dataclasses.dataclass(frozen=True)
+class Restored:
+    """A run's agent and its newest model, taken after `step` real steps."""
+
+    agent: Agent
+    model: SavedModel
+    step: int
+
+
+def restore(record: RunRecord, reporter: Reporter) -> Restored:
+    """The newest model of a run.
+
+    Args:
+      record: of the run.
+      reporter: where warnings about damaged checkpoints go.
+
+    Raises:
+      UserError: the run has no checkpoint, or none that is whole.
+    """
+    agent = agent_for(record.config, reporter)
+    template = jax.eval_shape(lambda key: SavedModel.of(agent.init(key)), jax.random.key(0))
+    restored = checkpoint.restore_latest(record.folder / "checkpoints", template)
+    if restored is None:
+        raise no_checkpoint(record)
+    for warning in restored.warnings:
+        reporter.warning(warning)
+    return Restored(agent, restored.model, restored.step)
+
+
+def no_checkpoint(record: RunRecord) -> UserError:
+    """The error that a run has nothing to restore."""
+    return UserError(f"{record.folder} has no checkpoint; run it first: suite run {record.config.task}")
+
+
+_agents: dict[Config, Agent] = {}  # the last one built
+
+
+def agent_for(config: Config, reporter: Reporter) -> Agent:
+    """The agent of a configuration. Those that differ by seed or in when runs are evaluated and saved share one.
+
+    With it they share its compiled programs. Those of the agent before are dropped: they would stay for good, and on a
+    CPU each agent's are thousands of memory maps, of which Linux gives a process 65,530. XLA crashes where they end.
+    """
+    shared = dataclasses.replace(config, seed=0, evaluation=EvaluationConfig(), checkpoint=CheckpointConfig())
+    if shared not in _agents:
+        _agents.clear()
+        jax.clear_caches()
+        enable_compilation_cache()
+        environment = registry.task(config.task).make()(progress=reporter.texture)
+        _agents[shared] = Agent(shared, environment)
+    return _agents[shared]

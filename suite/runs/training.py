@@ -1,0 +1,264 @@
+"""One run, start to finish: build, resume, train, evaluate, record."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from suite import registry
+from suite.agent.algorithm import iterate, iteration_key, start_key
+from suite.agent.dyna import Agent, TrainState
+from suite.configuration.schema import Config
+from suite.records import checkpoint
+from suite.records.record import RunRecord, disk_full_is_an_error, run_folder
+from suite.runs.evaluation import episode_rows, record_evaluation
+from suite.runs.saved_model import SavedModel, agent_for
+from suite.runtime.errors import RunError, UserError, host_errors
+from suite.runtime.reporting import Reporter
+from suite.world_model.training import WorldModelLearner
+
+PHASES = ("start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint")
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What a run came to. `status`: "finished", "stopped" (by a signal) or "already finished"."""
+
+    folder: Path
+    status: str
+    steps: int
+    wall_seconds: float
+    scores: dict[str, float]
+
+
+def run(config: Config, out: Path, reporter: Reporter, resume: bool = False) -> Result:
+    """Trains one agent on one task, or goes on where an earlier call of the same command stopped.
+
+    Args:
+      config: the resolved configuration.
+      out: the folder of all runs; this one's is `<out>/<task>/<agent>/<preset>/seed_<n>`.
+      reporter: where progress goes.
+      resume: insist that there is a run to go on with.
+
+    Raises:
+      UserError: before anything is compiled: the folder cannot be written, is in use, or holds another run.
+      RunError: the loss diverged or the disk is full; the last good checkpoint stays.
+    """
+    entry = registry.task(config.task)
+    folder = run_folder(out, config)
+    if resume and not (folder / "record.json").exists():
+        raise UserError(f"nothing to resume in {folder}: run without --resume to start there")
+    with RunRecord.open_or_create(folder, config, entry.spec()) as record, disk_full_is_an_error():
+        if record.finished:
+            return _result(record, "already finished")
+        return _Training(config, agent_for(config, reporter), record, reporter).run()
+
+
+class _Training:
+    """The host's side of a run: phases in order, their metrics and timing, checkpoints, signals."""
+
+    def __init__(self, config: Config, agent: Agent, record: RunRecord, reporter: Reporter):
+        self.config, self.agent, self.record, self.reporter = config, agent, record, reporter
+        self.checkpoints = record.folder / "checkpoints"
+        self.iteration = self.steps = 0
+        self.found: dict[str, Any] = {}  # the present iteration's metrics
+        self.rows: list[dict[str, Any]] = []  # and the episodes that ended in it
+        self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
+        self.recorded_seconds: dict[str, float] = {}  # of those, what timing.csv has
+        self.stop_requested = False
+
+    @property
+    def done(self) -> bool:
+        """No whole iteration fits the budget any more."""
+        return self.steps + self.config.steps_per_iteration > self.config.protocol.steps
+
+    def run(self) -> Result:
+        started = time.monotonic()
+        self.reporter.start(self.config.protocol.steps, 0)
+        try:
+            with self._phase("start"):
+                state = self._restore()
+            self.reporter.start(self.config.protocol.steps, self.steps)
+            with self._signals(), host_errors():
+                while not self.done and not self.stop_requested:
+                    before = self.steps
+                    state = self._iterate(state)
+                    # Before the checkpoint: what is evaluated after it would be missing if the run died in between.
+                    if self._passed(before, self.config.evaluation.every_steps):
+                        self._evaluate(state)
+                    if self._passed(before, self.config.checkpoint.every_steps) or self.stop_requested:
+                        self._save(state)
+                if self.done:
+                    self._finish(state)
+                else:
+                    self.record.update(status="stopped")
+        except RunError:
+            self.record.update(status="failed")
+            raise
+        finally:
+            self.reporter.stop()
+            self.record.add_wall_clock(time.monotonic() - started, self.seconds)
+        return _result(self.record, "finished" if self.record.finished else "stopped")
+
+    def _passed(self, before: int, every: int) -> bool:
+        """Whether the last iteration, begun at step `before`, reached another multiple of `every` (0: of nothing)."""
+        return bool(every) and self.steps // every > before // every
+
+    def _restore(self) -> TrainState:
+        key = start_key(self.config.seed)
+        template = jax.eval_shape(self.agent.init, key)
+        restored = checkpoint.restore_latest(self.checkpoints, *_split(template))
+        if restored is None:
+            self.record.rewind(0)
+            return self.agent.init(key)
+        for warning in restored.warnings:
+            self.reporter.warning(warning)
+        self.iteration, self.steps = restored.host["iteration"], restored.host["steps"]
+        self.seconds = restored.host["seconds"]
+        self.recorded_seconds = dict(self.seconds)
+        self.record.rewind(self.steps)
+        self.reporter.message(f"resuming at step {self.steps:,}")
+        return _join(restored.model, restored.resume)
+
+    def _iterate(self, state: TrainState) -> TrainState:
+        """One iteration of Algorithm 1, and what it leaves in the record."""
+        self.found, self.rows = {}, []
+        key = iteration_key(self.config.seed, self.iteration)
+        self.iteration += 1
+        state, _ = iterate(self.agent, state, key, self.steps, self._call)
+        self.record.append_episodes(self.rows)
+        returns = [row["return"] for row in self.rows]
+        mean_return = float(np.mean(returns)) if returns else None
+        summary = {"reward_per_step": self.found.pop("reward_per_step"), "episodes": len(returns)}
+        row = {"step": self.steps, **summary, "return": mean_return, **self.found}
+        self.record.append_metrics(row, self.agent.metric_names)
+        self._record_timing()
+        self.reporter.update(self.steps, "", {} if mean_return is None else {"return": mean_return})
+        return state
+
+    def _call(self, phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Runs and times a phase; keeps its metrics and, of real play, the episodes."""
+        if phase == "remember":  # the end of collecting, and nothing to wait for
+            with self._timed("collect"):
+                return function(*arguments)
+        with self._phase(phase):
+            result = function(*arguments)
+            if phase == "collect":
+                _, trajectory, log = result
+                log = jax.device_get(log)
+                self.rows, taken = episode_rows(log, self.agent.spec, log.ended_TB, self.steps)
+                self.steps += taken
+                self.found["reward_per_step"] = float(trajectory.reward_TB.mean())
+            else:
+                self.found |= self._check(phase, result[1])
+        return result
+
+    def _record_timing(self) -> None:
+        """Seconds per phase since the last iteration's row; the first compiles."""
+        since = {name: self.seconds.get(name, 0.0) - self.recorded_seconds.get(name, 0.0) for name in PHASES}
+        self.record.append_timing({"step": self.steps, **since})
+        self.recorded_seconds = dict(self.seconds)
+
+    @contextlib.contextmanager
+    def _phase(self, name: str) -> Iterator[None]:
+        self.reporter.update(self.steps, name, {})
+        with self._timed(name):
+            yield
+
+    @contextlib.contextmanager
+    def _timed(self, name: str) -> Iterator[None]:
+        start = time.monotonic()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
+
+    def _check(self, phase: str, metrics: dict[str, jax.Array]) -> dict[str, float]:
+        """Metrics on the host, prefixed by their phase; stops the run where a loss or gradient is not finite."""
+        found = {f"{phase}/{name}": float(value) for name, value in jax.device_get(metrics).items()}
+        for name, value in found.items():
+            if not np.isfinite(value):
+                kept = checkpoint.latest_step(self.checkpoints)
+                where = "no checkpoint was saved yet" if kept is None else f"the checkpoint at step {kept:,} is kept"
+                raise RunError(f"{name} became {value} in phase {phase} at step {self.steps:,}; {where}")
+        return found
+
+    def _evaluate(self, state: TrainState) -> None:
+        """Plays whole episodes with the present policy, unless there are some of this step already."""
+        if self.record.has_evaluation(self.steps):
+            return
+        with self._phase("evaluate"):
+            episodes = self.config.evaluation.episodes
+            record_evaluation(self.record, self.agent, state.learner.acting, self.steps, episodes)
+
+    def _save(self, state: TrainState) -> None:
+        with self._phase("checkpoint"):
+            host = {"iteration": self.iteration, "steps": self.steps, "seconds": self.seconds}
+            model, resume = _split(state)
+            checkpoint.save(self.checkpoints, self.steps, model, resume, host, keep=self.config.checkpoint.keep)
+
+    def _finish(self, state: TrainState) -> None:
+        """Saves the last checkpoint, plays the final evaluation, and closes the record."""
+        if checkpoint.latest_step(self.checkpoints) != self.steps:
+            self._save(state)
+        self._evaluate(state)
+        self.record.finish(self.steps)
+        checkpoint.drop_resume(self.checkpoints)
+
+    @contextlib.contextmanager
+    def _signals(self) -> Iterator[None]:
+        """The first SIGINT or SIGTERM ends the run after this iteration, with a checkpoint; the second at once."""
+
+        def stop(number: int, frame: Any) -> None:
+            if self.stop_requested:
+                raise KeyboardInterrupt
+            self.stop_requested = True
+            self.reporter.message("stopping after this iteration, with a checkpoint (again: stop now)")
+
+        try:
+            before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        except ValueError:  # not in the main thread: whoever runs us there handles signals
+            before = {}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def _split(state: TrainState) -> tuple[SavedModel, dict[str, Any]]:
+    """A checkpoint's two items: what evaluation needs, and what only going on needs."""
+    world_model = state.world_model
+    resume = {"optimizer": state.learner.optimizer, "player": state.player, "replay": state.replay}
+    resume |= {"world_model_optimizer": None, "world_model_trained": None, "world_model_measured": None}
+    if world_model is not None:
+        resume["world_model_optimizer"] = world_model.optimizer
+        resume["world_model_measured"] = world_model.measured
+        if world_model.averaged is not None:
+            resume["world_model_trained"] = world_model.params
+    return SavedModel.of(state), resume
+
+
+def _join(model: SavedModel, resume: dict[str, Any]) -> TrainState:
+    """The inverse of `_split`."""
+    world_model, trained = None, resume["world_model_trained"]
+    if model.world_model is not None:
+        world_model = WorldModelLearner(
+            params=model.world_model if trained is None else trained,
+            optimizer=resume["world_model_optimizer"],
+            averaged=None if trained is None else model.world_model,
+            measured=resume["world_model_measured"],
+        )
+    learner = dataclasses.replace(model.learner, optimizer=resume["optimizer"])
+    return TrainState(learner, resume["player"], resume["replay"], model.tokenizer, world_model)
+
+
+def _result(record: RunRecord, status: str) -> Result:
+    scores = registry.task(record.config.task).scores()(record.episodes(), record.config, record.spec)
+    return Result(record.folder, status, record.steps, record.wall_seconds, scores)

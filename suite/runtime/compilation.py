@@ -1,0 +1,45 @@
+"""JAX's persistent compilation cache: the second start of a command compiles nothing that the first one compiled."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+from pathlib import Path
+
+from suite.runtime.cache import cache_dir
+
+MIN_COMPILE_SECONDS = 0.5  # below this, reading the cache costs as much as compiling
+CPU_INFO = Path("/proc/cpuinfo")
+
+
+def quiet_xla() -> None:
+    """Silences XLA's own log, unless the user set its level: call it before JAX is imported.
+
+    Each program that XLA loads from the cache otherwise prints a page about features that no CPU has. So does JAX of
+    an error on the host, which reaches us as an exception besides (`suite.runtime.errors.host_errors`).
+    """
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
+
+
+def enable_compilation_cache() -> None:
+    """Keeps compiled programs in the user's cache folder (`SUITE_CACHE_DIR`), unless JAX was told of another."""
+    import jax
+
+    if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        jax.config.update("jax_compilation_cache_dir", str(cache_dir() / "xla" / cpu_digest()))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def cpu_digest() -> str:
+    """Tells kinds of CPU apart: a program compiled for one may hold instructions that another lacks."""
+    try:
+        lines = CPU_INFO.read_text().splitlines()
+    except OSError:  # not Linux
+        lines = []
+    flags = next((line for line in lines if line.lower().startswith(("flags", "features"))), "")
+    features = " ".join(sorted(flags.partition(":")[2].split()))
+    return hashlib.sha256(f"{platform.machine()} {features}".encode()).hexdigest()[:8]

@@ -1,0 +1,395 @@
+from __future__ import annotations
+
+import copy
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
+
+from adapters import register_all
+from adapters.gymnasium import export as gymnasium_export
+from adapters.gymnasium import task as gymnasium_bridge
+from suite import registry
+from suite.interface.batching import Batched
+from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
+from suite.runtime.errors import UserError
+from tests.contract import check_environment, check_spec, check_types
+from tests.tiny import CORRIDOR, Corridor, Pennies
+
+EXPORTED = sorted(id for id, task in registry.tasks().items() if task.family not in gymnasium_export.NOT_EXPORTED)
+MINIGRID = pytest.param("MiniGrid-Empty-5x5-v0", marks=pytest.mark.skipif("not has_minigrid()"))
+
+
+@pytest.fixture
+def corridor(monkeypatch):
+    """The corridor as a registered task; its name in Gymnasium."""
+    monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR))
+    register_all()
+    yield "suite/corridor-v0"
+    gymnasium.registry.pop("suite/corridor-v0")
+
+
+class Symbols:
+    """Shows its time as two symbols, and never ends."""
+
+    spec = EnvironmentSpec("symbols", ObservationSpec((2,), 255, "symbols"), 2, (0.0, 1.0))
+
+    def reset(self, key):
+        return jax.numpy.int32(0), self._show(0)
+
+    def step(self, key, state, action):
+        return state + 1, self._show(state + 1)
+
+    def _show(self, time):
+        no, observation = jax.numpy.zeros((), bool), jax.numpy.stack([time % 256, 255]).astype(jax.numpy.uint8)
+        return TimeStep(observation, jax.numpy.float32(0), no, no, no, observation, {})
+
+
+# Out.
+
+
+def test_importing_registers_and_builds_nothing():
+    code = (
+        "import adapters.gymnasium, gymnasium, sys; spec = gymnasium.spec('suite/craftax_classic-v0'); "
+        "assert spec.vector_entry_point and 'jax' not in sys.modules and 'craftax' not in sys.modules; print(spec.id)"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("suite/craftax_classic-v0\n", "")
+
+
+def test_every_single_agent_task_is_registered():
+    assert "craftax_classic" in EXPORTED
+    for id in EXPORTED:
+        assert gymnasium.spec(f"suite/{id.replace('/', '_')}-v0").kwargs == {"task": id}
+
+
+@pytest.mark.parametrize("id", [id for id in EXPORTED if id != "craftax_full"])
+def test_check_env(id):
+    """Craftax (full) goes the way of Craftax-classic; compiling it alone takes half a minute."""
+    check_env(gymnasium.make(f"adapters.gymnasium:suite/{id.replace('/', '_')}-v0").unwrapped)
+
+
+def test_check_env_of_a_tiny_task(corridor):
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*minimum and maximum|.*image")  # what a picture should be
+        check_env(gymnasium.make(corridor).unwrapped)
+
+
+def test_single_plays_the_environment_by_its_seed(corridor):
+    environment = Corridor()
+    env = gymnasium_export.SuiteEnv(environment)
+    observation, info = env.reset(seed=5)
+    key, reset_key = jax.random.split(jax.random.key(5))
+    state, shown = environment.reset(reset_key)
+    np.testing.assert_array_equal(observation, shown.observation)
+    assert info["achievement_return"] == 0.0
+    random = np.random.default_rng(0)
+    ends = {"terminated": 0, "truncated": 0}
+    for _ in range(60):
+        action = int(random.random() < 0.6)
+        observation, reward, terminated, truncated, info = env.step(action)
+        key, step_key = jax.random.split(key)
+        state, shown = environment.step(step_key, state, jax.numpy.int32(action))
+        np.testing.assert_array_equal(observation, shown.observation)
+        assert (reward, terminated, truncated) == (shown.reward, shown.terminated, shown.truncated)
+        assert set(info) == {"achievements", "achievement_return", "health_return"}
+        np.testing.assert_array_equal(info["achievements"], shown.statistics["achievements"])
+        if terminated or truncated:
+            ends["terminated" if terminated else "truncated"] += 1
+            with pytest.raises(gymnasium.error.ResetNeeded):
+                env.step(0)
+            env.reset()
+            key, reset_key = jax.random.split(key)
+            state, shown = environment.reset(reset_key)
+    assert min(ends.values()) > 0
+
+
+def test_vector_is_batched(corridor):
+    B = 5
+    envs = gymnasium.make_vec(corridor, num_envs=B)
+    assert envs.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.SAME_STEP
+    batched = Batched(Corridor(), B)
+    step = jax.jit(batched.step)
+    observation_B, _ = envs.reset(seed=3)
+    key, reset_key = jax.random.split(jax.random.key(3))
+    state, shown = batched.reset(reset_key)
+    np.testing.assert_array_equal(observation_B, shown.observation)
+    random = np.random.default_rng(0)
+    for _ in range(40):
+        action_B = (random.random(B) < 0.7).astype(int)
+        observation_B, reward_B, terminated_B, truncated_B, info = envs.step(action_B)
+        key, step_key = jax.random.split(key)
+        state, shown = step(step_key, state, action_B.astype(np.int32))
+        assert envs.observation_space.contains(observation_B)
+        np.testing.assert_array_equal(observation_B, shown.observation)
+        np.testing.assert_array_equal(reward_B, shown.reward)
+        np.testing.assert_array_equal(terminated_B, shown.terminated)
+        np.testing.assert_array_equal(truncated_B, shown.truncated)
+        ended_B = terminated_B | truncated_B
+        np.testing.assert_array_equal(info["_achievement_return"], ~ended_B)
+        assert ("final_obs" in info) == ended_B.any()
+        if ended_B.any():
+            np.testing.assert_array_equal(info["_final_obs"], ended_B)
+            np.testing.assert_array_equal(info["final_info"]["achievement_return"], np.where(ended_B, reward_B, 0))
+            for b in range(B):
+                if ended_B[b]:
+                    np.testing.assert_array_equal(info["final_obs"][b], shown.final_observation[b])
+                else:
+                    assert info["final_obs"][b] is None
+
+
+def test_vector_tells_what_gymnasiums_own_vector_tells(corridor):
+    """Same spaces, and the same information at an end, but for the new episode's statistics, which are not known."""
+    ours = gymnasium.make_vec(corridor, num_envs=2)
+    mode = gymnasium.vector.AutoresetMode.SAME_STEP
+    theirs = gymnasium.make_vec(corridor, 2, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode})
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+
+    def to_the_end(envs):
+        envs.reset(seed=0)
+        steps = [envs.step(np.ones(2, int)) for _ in range(3)]  # both arrive within three
+        return next(step for step in steps if "final_obs" in step[-1])
+
+    (*shown, info), (*expected, expected_info) = to_the_end(ours), to_the_end(theirs)
+    for array, other in zip(shown, expected, strict=True):
+        assert array.shape == other.shape
+    assert set(info) == set(expected_info)
+    assert set(info["final_info"]) == set(expected_info["final_info"])
+    for name, value in info["final_info"].items():
+        assert (value.shape, value.dtype.kind) == (
+            expected_info["final_info"][name].shape,
+            expected_info["final_info"][name].dtype.kind,
+        )
+
+
+def test_vector_wrappers_count_episodes(corridor):
+    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(gymnasium.make_vec(corridor, num_envs=3))
+    envs.reset(seed=0)
+    for _ in range(20):
+        envs.step(np.ones(3, int))
+    assert list(envs.return_queue) == [1.0] * len(envs.return_queue) and envs.episode_count >= 15
+
+
+def test_symbols_are_multi_discrete():
+    env = gymnasium_export.SuiteEnv(Symbols())
+    assert env.observation_space == spaces.MultiDiscrete([256, 256])
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+    assert env.step(np.int64(1))[0].tolist() == [1, 255]
+
+
+def test_render_is_the_observation():
+    spec = EnvironmentSpec("seen", ObservationSpec((2, 2, 3), 255, "pixels", (1, 1)), 2, (0.0, 1.0))
+    environment = Symbols()
+    environment.spec = spec
+    environment._show = lambda time: TimeStep(
+        *(frame := jax.numpy.full((2, 2, 3), 7, jax.numpy.uint8), jax.numpy.float32(0)),
+        *[jax.numpy.zeros((), bool)] * 3,
+        frame,
+        {},
+    )
+    env = gymnasium_export.SuiteEnv(environment, render_mode="rgb_array")
+    observation, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), observation)
+
+
+def test_misuse_is_one_error():
+    env = gymnasium_export.SuiteEnv(Corridor())
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(0)
+    env.reset()
+    with pytest.raises(gymnasium.error.InvalidAction, match="2 is no action"):
+        env.step(2)
+    envs = gymnasium_export.SuiteVectorEnv(Corridor(), 2)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step([0, 0])
+    with pytest.raises(UserError, match="one seed"):
+        envs.reset(seed=[1, 2])
+    with pytest.raises(UserError, match="reset_mask"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.reset()
+    with pytest.raises(gymnasium.error.InvalidAction):
+        envs.step([0, 2])
+    with pytest.raises(UserError, match="cannot be rendered"):
+        gymnasium_export.SuiteEnv(Corridor(), render_mode="rgb_array")
+    with pytest.raises(UserError, match="game of two players"):
+        gymnasium_export.SuiteEnv(Pennies())
+    with pytest.raises(UserError, match="unknown task"):
+        gymnasium_export.SuiteEnv("nethack")
+
+
+# In.
+
+
+def has_minigrid():
+    import importlib.util
+
+    return importlib.util.find_spec("minigrid") is not None
+
+
+def as_seen(id, observation):
+    if id.startswith("MiniGrid"):
+        return observation["image"]
+    return [observation // 23, observation % 23] if id.startswith("Taxi") else [observation]
+
+
+@pytest.mark.parametrize("id", ["FrozenLake-v1", "Taxi-v4", MINIGRID])
+def test_imported_equals_the_engine(id):
+    """Over resets, ends and time limits; ours batched and compiled, theirs driven directly."""
+    T, B = 250, 3
+    environment = gymnasium_bridge.make(id)
+    batched = Batched(environment, B)
+    action_TB = np.random.default_rng(1).integers(environment.spec.num_actions, size=(T, B)).astype(np.int32)
+
+    def step(carry, inputs):
+        carry = batched.step(inputs[0], carry[0], inputs[1])
+        return carry, carry
+
+    start = jax.jit(batched.reset)(jax.random.key(0))
+    _, (state, shown) = jax.jit(lambda *a: jax.lax.scan(step, *a))(
+        start, (jax.random.split(jax.random.key(1), T), action_TB)
+    )
+    state, shown = jax.device_get((state, shown))
+    ends = 0
+    for b in range(B):
+        env = gymnasium.make("minigrid:" + id if id.startswith("MiniGrid") else id)
+        observation, _ = env.reset(seed=int(start[0].seed[b]))
+        np.testing.assert_array_equal(start[1].observation[b], as_seen(id, observation))
+        for t in range(T):
+            observation, reward, terminated, truncated, _ = env.step(action_TB[t, b])
+            np.testing.assert_array_equal(shown.final_observation[t, b], as_seen(id, observation))
+            assert shown.reward[t, b] == np.float32(reward)
+            assert (shown.terminated[t, b], shown.truncated[t, b]) == (terminated, truncated and not terminated)
+            if terminated or truncated:
+                ends += 1
+                observation, _ = env.reset(seed=int(state.seed[t, b]))
+            np.testing.assert_array_equal(shown.observation[t, b], as_seen(id, observation))
+    assert ends >= 3
+
+
+@pytest.mark.parametrize("id", ["FrozenLake-v1", "Taxi-v4", MINIGRID])
+def test_imported_contract(id):
+    assert check_environment(gymnasium_bridge.make(id), jax.random.key(0), steps=210, num_envs=4).ended.any()
+
+
+def test_imported_is_exported_again():
+    env = gymnasium_export.SuiteEnv(gymnasium_bridge.make("FrozenLake-v1"))
+    env.reset(seed=0)
+    assert env.observation_space == spaces.MultiDiscrete([16])
+    assert env.step(1)[1:4] == (0.0, False, False)
+
+
+class Foreign(gymnasium.Env):
+    """With any spaces."""
+
+    def __init__(self, observation_space, actions=spaces.Discrete(3, start=5)):  # noqa: B008
+        self.observation_space, self.action_space = copy.deepcopy(observation_space), actions
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return self.observation_space.sample(), 0.5 * (action - 5), False, False, {}
+
+
+@pytest.fixture
+def foreign():
+    """Registers an environment with given spaces."""
+
+    def register(*args, **kwargs):
+        gymnasium.register("tests/foreign-v0", entry_point=lambda: Foreign(*args), **kwargs)
+        gymnasium_bridge._imported.cache_clear()
+        return "tests/foreign-v0"
+
+    yield register
+    gymnasium.registry.pop("tests/foreign-v0", None)
+
+
+@pytest.mark.parametrize(
+    ("space", "seen"),
+    [
+        (spaces.Box(0, 255, (12, 8, 3), np.uint8), ObservationSpec((12, 8, 3), 255, "pixels", (2, 2))),
+        (spaces.Box(0, 255, (21, 9), np.uint8), ObservationSpec((21, 9, 1), 255, "pixels", (3, 3))),
+        (spaces.Box(0, 1, (6, 7, 2), np.uint8), ObservationSpec((6, 7, 2), 1, "grid", (1, 1))),
+        (spaces.Discrete(256, start=-3), ObservationSpec((1,), 255, "symbols")),
+        (spaces.Discrete(257), ObservationSpec((2,), 16, "symbols")),
+        (spaces.MultiDiscrete([[3, 4], [256, 2]], start=[[1, 0], [0, 0]]), ObservationSpec((4,), 255, "symbols")),
+    ],
+)
+def test_observations(foreign, space, seen):
+    environment = gymnasium_bridge.make(foreign(space, max_episode_steps=7))
+    assert environment.spec.observation == seen
+    assert environment.spec.reward_classes == (0.0, 0.5, 1.0)
+    assert environment.limit == 7
+    check_spec(environment)
+    check_types(environment, num_envs=2)
+    state, shown = environment.reset(jax.random.key(0))
+    env = Foreign(space)
+    expected, _ = env.reset(seed=int(state.seed))
+    for _ in range(7):
+        np.testing.assert_array_equal(number(seen, shown.observation), number_of(space, expected))
+        state, shown = environment.step(jax.random.key(0), state, jax.numpy.int32(2))
+        expected, *_ = env.step(7)
+        assert shown.reward == 1
+    assert shown.truncated and not shown.terminated
+
+
+def number(seen, observation):
+    """Digits are put together again."""
+    if seen.kind != "symbols" or len(observation) != 2:
+        return np.asarray(observation).ravel()
+    return np.asarray(observation, int) @ [seen.high + 1, 1]
+
+
+def number_of(space, observation):
+    return np.ravel(observation) - np.ravel(getattr(space, "start", 0))
+
+
+@pytest.mark.parametrize(
+    ("id", "message"),
+    [
+        ("Pendulum-v1", "gymnasium/Pendulum-v1 cannot be a task: its actions are Box of float32, not Discrete"),
+        ("CartPole-v1", "cannot be a task: its observations are Box of float32, not uint8 boxes or discrete"),
+        ("Blackjack-v1", "cannot be a task: its observations are Tuple, not uint8 boxes or discrete"),
+        ("FrozenLoch-v1", "gymnasium/FrozenLoch-v1: Environment `FrozenLoch` doesn't exist"),
+        ("no_such_package:Lake-v1", "gymnasium/no_such_package:Lake-v1: No module named 'no_such_package'"),
+        ("Taxi-v3", "deprecated"),
+    ],
+)
+def test_unsupported(id, message):
+    for ask in (gymnasium_bridge.spec, gymnasium_bridge.make):
+        with pytest.raises(UserError) as error:
+            ask(id)
+        assert message in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("args", "kwargs", "message"),
+    [
+        ((spaces.Box(0, 255, (8, 8, 4), np.uint8),), {}, r"not \[height, width\]"),
+        ((spaces.Discrete(2), spaces.Discrete(1)), {}, "two or more"),
+        ((spaces.Discrete(2),), {"nondeterministic": True}, "not determined by its seed"),
+    ],
+)
+def test_unsupported_spaces(foreign, args, kwargs, message):
+    with pytest.raises(UserError, match=message):
+        gymnasium_bridge.spec(foreign(*args, **kwargs))
+
+
+@pytest.mark.parametrize(
+    ("sides", "patch"),
+    [((63, 63), (7, 7)), ((7, 7), (1, 1)), ((84, 84), (12, 12)), ((210, 160), (30, 20)), ((97, 9), (97, 1))],
+)
+def test_patch(sides, patch):
+    assert gymnasium_bridge.patch(*sides) == patch

@@ -1,0 +1,245 @@
+"""Whole runs on a tiny task: resuming, stopping, diverging, evaluating."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import jax
+import numpy as np
+import pandas as pd
+import pytest
+
+from suite import registry
+from suite.agent.dyna import Agent
+from suite.records.record import RunRecord
+from suite.runs import evaluation, training
+from suite.runs.saved_model import restore
+from suite.runtime.errors import RunError, UserError
+from suite.runtime.reporting import QuietReporter
+from tests.tiny import CORRIDOR, PENNIES
+
+
+@pytest.fixture(autouse=True)
+def corridor(monkeypatch):
+    monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR, PENNIES))
+
+
+class StopAt(QuietReporter):
+    """Sends this process a signal when a phase begins for the n-th time: as a user, or a cluster, would."""
+
+    def __init__(self, phase: str, times: int):
+        super().__init__()
+        self.phase, self.times = phase, times
+
+    def update(self, steps, phase, fields):
+        if phase == self.phase:
+            self.times -= 1
+            if self.times == 0:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+
+class Killed(Exception):  # noqa: N818 -- no error of the run's
+    pass
+
+
+class KillAt(StopAt):
+    """Ends the run on the spot, as `kill -9` does: nothing more is written."""
+
+    def update(self, steps, phase, fields):
+        if phase == self.phase:
+            self.times -= 1
+            if self.times == 0:
+                raise Killed
+
+
+EVERYTHING = "world_model.optimizer=muon", "world_model.average=0.5"  # that a checkpoint of m5 may hold besides
+
+
+def config(agent: str = "m5", *overrides: str, seed: int = 0):
+    return registry.resolve("corridor", agent, "smoke", EVERYTHING + overrides, seed)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """What must not depend on how often a run was stopped."""
+    names = ("config.json", "episodes.csv", "metrics.csv", "evaluations.csv")
+    return {name: (folder / name).read_bytes() for name in names}
+
+
+def last_model(folder: Path):
+    return [np.asarray(x) for x in jax.tree.leaves(restore(RunRecord.open(folder, lock=False), QuietReporter()).model)]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR))
+        result = training.run(config(), tmp_path_factory.mktemp("whole"), QuietReporter())
+    assert result.status == "finished"
+    return result
+
+
+def assert_same(result, uninterrupted):
+    assert result.status == "finished"
+    assert files(result.folder) == files(uninterrupted.folder)
+    mine_and_theirs = (last_model(training.folder) for run in (result, uninterrupted))
+    for mine, theirs in zip(*mine_and_theirs, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    assert result.scores == uninterrupted.scores
+
+
+def programs() -> list[int]:
+    """How many programs each phase has."""
+    phases = (Agent.start, Agent.collect, Agent.remember, Agent.learn)
+    phases += (Agent.update_tokenizer, Agent.update_world_model, Agent.imagine)
+    return [phase._cache_size() for phase in phases]
+
+
+@pytest.mark.parametrize(("phase", "times"), [("collect", 3), ("imagine", 2)])
+def test_a_stopped_and_resumed_run_is_an_uninterrupted_one(tmp_path, uninterrupted, phase, times):
+    stopped = training.run(config(), tmp_path, StopAt(phase, times))
+    assert stopped.status == "stopped"
+    assert 0 < stopped.steps < config().total_steps
+    before = programs()
+    assert_same(training.run(config(), tmp_path, QuietReporter(), resume=True), uninterrupted)
+    assert programs() == before  # what was read from disk is to JAX what was computed: it compiles nothing anew
+
+
+PHASES = ["start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint", "evaluate"]
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path, uninterrupted, phase):
+    late = {"start": 1, "checkpoint": 2, "evaluate": 1, "imagine": 2}.get(phase, 5)
+    with pytest.raises(Killed):
+        training.run(config(), tmp_path, KillAt(phase, late))
+    result = training.run(config(), tmp_path, QuietReporter())
+    assert_same(result, uninterrupted)
+
+
+def test_what_is_played_again_was_recorded_first_and_is_kept(tmp_path):
+    with pytest.raises(Killed):
+        training.run(config(), tmp_path, KillAt("collect", 4))  # three iterations recorded, a checkpoint after two
+    result = training.run(config(), tmp_path, QuietReporter())
+    aside = list((result.folder / "replaced").glob("*/metrics.csv"))
+    assert len(aside) == 1
+    replaced = pd.read_csv(aside[0])
+    metrics = pd.read_csv(result.folder / "metrics.csv")
+    assert replaced["step"].tolist() == [96]
+    pd.testing.assert_frame_equal(replaced, metrics[metrics["step"] == 96].reset_index(drop=True))
+
+
+def test_a_finished_run_is_not_run_again(uninterrupted):
+    before = files(uninterrupted.folder)
+    again = training.run(config(), uninterrupted.folder.parents[3], QuietReporter())
+    assert again.status == "already finished"
+    assert again.scores == uninterrupted.scores
+    assert files(uninterrupted.folder) == before
+
+
+def test_records_are_complete(uninterrupted):
+    fields = json.loads((uninterrupted.folder / "record.json").read_text())
+    assert fields["status"] == "finished"
+    assert fields["steps"] == 192
+    assert {"collect", "learn", "tokenizer", "world_model", "imagine", "evaluate", "total"} <= set(
+        fields["wall_clock_seconds"]
+    )
+    metrics = pd.read_csv(uninterrupted.folder / "metrics.csv")
+    assert metrics["step"].tolist() == [32, 64, 96, 128, 160, 192]
+    assert metrics["imagine/policy_loss"].notna().tolist() == [False, False, True, True, True, True]
+    assert metrics["world_model/observation_loss"].iloc[-1] < metrics["world_model/observation_loss"].iloc[0]
+    episodes = pd.read_csv(uninterrupted.folder / "episodes.csv")
+    assert (episodes["return"] == episodes["arrive"]).all()
+    assert (episodes["length"] <= 6).all()
+    assert not (uninterrupted.folder / "checkpoints" / "step_000000000192" / "resume").exists()
+
+
+def test_the_first_episodes_of_an_evaluation_are_whole(tmp_path, uninterrupted):
+    folder = shutil.copytree(uninterrupted.folder, tmp_path / "copy")
+    scores = evaluation.evaluate(folder, 10, QuietReporter())
+    assert scores["step"] == 192
+    assert scores["episodes"] == 12  # three rounds of four environments
+    rows = pd.read_csv(folder / "evaluations.csv")
+    assert len(rows) == 4 + 12  # the run's own, and these
+
+
+def test_evaluations_beside_training_leave_it_as_it_is(tmp_path, uninterrupted):
+    settings = config("m5", "evaluation.every_steps=64", "evaluation.episodes=8")
+    with pytest.raises(Killed):
+        training.run(settings, tmp_path, KillAt("checkpoint", 2))  # the evaluation before it is thrown away
+    folder = training.run(settings, tmp_path, QuietReporter()).folder
+    for name in ("episodes.csv", "metrics.csv"):
+        assert (folder / name).read_bytes() == (uninterrupted.folder / name).read_bytes()
+    rows = pd.read_csv(folder / "evaluations.csv")
+    assert rows["step"].value_counts(sort=False).to_dict() == {64: 8, 128: 8, 192: 8}
+    rounds = [part.drop(columns="step").to_numpy().tolist() for _, part in rows.groupby("step")]
+    assert rounds[0] != rounds[1]  # randomness of their own
+
+
+def test_a_broken_checkpoint_gives_way_to_the_one_before(tmp_path, uninterrupted):
+    with pytest.raises(Killed):
+        training.run(config(), tmp_path, KillAt("collect", 6))
+    folder = next(tmp_path.glob("*/*/*/seed_0"))
+    newest = max((folder / "checkpoints").glob("step_*"))
+    file = max((newest / "resume").rglob("*"), key=lambda path: path.stat().st_size if path.is_file() else 0)
+    file.write_bytes(file.read_bytes()[:-1])
+    warned = []
+    reporter = QuietReporter()
+    reporter.warning = warned.append
+    assert_same(training.run(config(), tmp_path, reporter), uninterrupted)
+    assert len(warned) == 1
+    assert "damaged" in warned[0]
+
+
+def test_without_a_world_model_nothing_of_it_exists(tmp_path):
+    result = training.run(config("mfrl"), tmp_path, QuietReporter())
+    columns = pd.read_csv(result.folder / "metrics.csv").columns
+    assert not any(name.startswith(("tokenizer", "world_model", "imagine")) for name in columns)
+    assert "learn/entropy" in columns
+
+
+def test_random_learns_nothing(tmp_path):
+    result = training.run(config("random"), tmp_path, QuietReporter())
+    assert list(pd.read_csv(result.folder / "metrics.csv").columns) == ["step", "reward_per_step", "episodes", "return"]
+
+
+def test_seeds_differ(tmp_path):
+    first, second = (training.run(config("random", seed=seed), tmp_path, QuietReporter()) for seed in (0, 1))
+    assert files(first.folder)["episodes.csv"] != files(second.folder)["episodes.csv"]
+
+
+def test_a_diverged_loss_stops_the_run_and_says_where(tmp_path):
+    settings = config("mfrl", "ppo.learning_rate=1e30", "ppo.max_grad_norm=1e30")
+    with pytest.raises(RunError, match=r"learn/.* became .* in phase learn at step \d+"):
+        training.run(settings, tmp_path, QuietReporter())
+
+
+def test_resume_without_a_run_is_an_error(tmp_path):
+    with pytest.raises(UserError, match="nothing to resume"):
+        training.run(config(), tmp_path, QuietReporter(), resume=True)
+
+
+def test_chance_does_not_count_towards_the_budget(tmp_path):
+    """Fidelity note 32. An episode of pennies is three events, one of them chance's; all environments are in step."""
+    result = training.run(registry.resolve("pennies", "mfrl", "smoke"), tmp_path, QuietReporter())
+    # 4 environments play 8 events: three, three and two of them are chance's, in turn.
+    steps = pd.read_csv(result.folder / "metrics.csv")["step"]
+    assert steps.diff().tolist()[1:4] == [20, 24, 20] and steps[0] == 20
+    assert 150 - 32 < result.steps == steps.iloc[-1] <= 150
+    episodes = pd.read_csv(result.folder / "episodes.csv")
+    assert (episodes["length"] == 3).all()
+    assert episodes["step"].tolist()[:8] == [8] * 4 + [16] * 4  # two of three events count, in four environments
+    assert set(episodes["return"]) == {-1.0, 1.0}
+
+
+def test_a_game_that_was_stopped_goes_on_where_it_was(tmp_path):
+    config = registry.resolve("pennies", "m5", "smoke")
+    whole = training.run(config, tmp_path / "whole", QuietReporter())
+    assert training.run(config, tmp_path / "parts", StopAt("imagine", 2)).status == "stopped"
+    parts = training.run(config, tmp_path / "parts", QuietReporter())
+    assert parts.status == "finished" and files(parts.folder) == files(whole.folder)
+    metrics = pd.read_csv(whole.folder / "metrics.csv")
+    assert metrics["world_model/legal_accuracy"].notna().all() and metrics["world_model/chance_excess"].notna().all()
