@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from adapters.openspiel.tables import Tables
-from adapters.openspiel.task import task as openspiel
+from adapters.openspiel import task as openspiel
 from suite.interface.batching import Batched
 from suite.interface.turns import choose_event
 

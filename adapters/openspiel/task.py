@@ -25,8 +25,9 @@ import numpy as np
 from flax import struct
 
 from adapters.openspiel import host
+from adapters.openspiel import tables as game_tables
 from adapters.openspiel.host import MAX_REWARD_CLASSES, SIGNS
-from adapters.openspiel.tables import NotCategoricalError, Tables, TooLargeError, build, last_offer
+from adapters.openspiel.tables import Tables
 from suite.interface.environment import Environment, EnvironmentSpec, ObservationSpec, TimeStep
 from suite.interface.turns import Turn
 from suite.runtime.cache import cache_dir
@@ -129,14 +130,14 @@ def _walked(name: str, progress: Progress | None) -> Tables | None:
     tables = _read(path)
     if tables is None and not too_large.exists():
         game = _engine(name)
-        key = last_offer if name == "bargaining" else None
+        key = game_tables.last_offer if name == "bargaining" else None
         try:
-            tables = build(game, key, report)
-        except TooLargeError:
+            tables = game_tables.build(game, key, report)
+        except game_tables.TooLargeError:
             with contextlib.suppress(OSError):
                 too_large.parent.mkdir(parents=True, exist_ok=True)
                 too_large.touch()
-        except NotCategoricalError:
+        except game_tables.NotCategoricalError:
             raise _not_categorical(name) from None
         else:
             _write(path, tables)
@@ -294,7 +295,7 @@ def _measure_by_play(name: str) -> EnvironmentSpec:
     known = _specification(name, symbols, 1, game.num_distinct_actions(), game.max_chance_outcomes(), SIGNS)
     try:
         return host.measured(game, known)
-    except NotCategoricalError:
+    except game_tables.NotCategoricalError:
         raise _not_categorical(name) from None
 
 

@@ -46,8 +46,8 @@ def _foreign(family: str, name: str, scores: str) -> TaskEntry:
         id=f"{family}/{name}",
         family=family,
         summary=f"{name} of {family}",
-        spec=Made(f"adapters.{family}_bridge:spec", (name,)),
-        make=Lazy(f"adapters.{family}_bridge:make", (name,)),
+        spec=Made(f"adapters.{family}.task:spec", (name,)),
+        make=Lazy(f"adapters.{family}.task:make", (name,)),
         scores=Lazy(f"leaderboards.scoring:{scores}"),
         presets={
             "small": Lazy("baselines.presets:foreign_small"),

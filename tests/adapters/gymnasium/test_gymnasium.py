@@ -12,8 +12,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from adapters import register_all
 from adapters.gymnasium import export as gymnasium_export
+from adapters.gymnasium import register_all
 from adapters.gymnasium import task as gymnasium_bridge
 from suite import registry
 from suite.interface.batching import Batched

@@ -11,9 +11,9 @@ import numpy as np
 import pyspiel
 import pytest
 
-from adapters.openspiel.task import host as openspiel_host
-from adapters.openspiel.task import tables as game_tables
-from adapters.openspiel.task import task as openspiel
+from adapters.openspiel import host as openspiel_host
+from adapters.openspiel import tables as game_tables
+from adapters.openspiel import task as openspiel
 from suite import registry
 from suite.interface.host import HostEnvironment
 from suite.runs import training

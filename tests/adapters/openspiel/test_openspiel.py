@@ -14,8 +14,8 @@ import numpy as np
 import pyspiel
 import pytest
 
-from adapters.openspiel.task import tables as game_tables
-from adapters.openspiel.task import task as openspiel
+from adapters.openspiel import tables as game_tables
+from adapters.openspiel import task as openspiel
 from suite.runtime.errors import UserError
 from tests import games
 from tests.contract import check_environment
