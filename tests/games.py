@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from adapters.openspiel.tables import Tables
 from adapters.openspiel import task as openspiel
+from adapters.openspiel.tables import Tables
 from suite.interface.batching import Batched
 from suite.interface.turns import choose_event
 

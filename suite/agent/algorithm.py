@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from suite.agent.dyna import Agent, TrainState
+from suite.agent.dyna import Agent
+from suite.agent.state import TrainState
 
 Call = Callable[..., Any]
 

@@ -14,20 +14,21 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import nnx, struct
+from flax import nnx
 
 from suite.agent import rollout as play
 from suite.agent.replay import Experience, Replay, ReplayState
+from suite.agent.state import TrainState
 from suite.configuration.schema import Config
 from suite.interface.batching import Batched
-from suite.interface.environment import BatchedEnvironment, Environment, EnvironmentSpec, State
+from suite.interface.environment import BatchedEnvironment, Environment, State
 from suite.interface.host import HostEnvironment
-from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec, encode_frame
+from suite.interface.tokens import TokenizerState, encode_frame
 from suite.interface.turns import Turn, stream_action
 from suite.policy import ppo
 from suite.policy.actor_critic import make_policy
 from suite.runtime.errors import UserError
-from suite.tokenizers import make_tokenizer
+from suite.tokenizers.stream import build_tokenizer
 from suite.world_model import training as world_model_training
 from suite.world_model.ages import ages_of
 from suite.world_model.imagination import Dream, Past
@@ -35,43 +36,6 @@ from suite.world_model.transformer import WorldModel
 
 Metrics = dict[str, jax.Array]
 IMAGINATION_METRICS = (*ppo.METRICS, "reward_per_step", "termination_rate")
-
-
-@struct.dataclass
-class TrainState:
-    """Everything that a run carries from one iteration to the next.
-
-    Attributes:
-      learner: policy parameters, their optimizer, value statistics.
-      player: the real environments and the policy's memory of them.
-      replay, tokenizer, world_model: None for model-free agents.
-    """
-
-    learner: ppo.Learner
-    player: play.Player
-    replay: ReplayState | None = None
-    tokenizer: TokenizerState | None = None
-    world_model: world_model_training.WorldModelLearner | None = None
-
-
-def build_tokenizer(config: Config, spec: EnvironmentSpec) -> tuple[Tokenizer, TokenSpec, tuple[int, int]]:
-    """The tokenizer, the token stream it makes for the world model, and the frame's (rows, columns) of tokens."""
-    tokenizer = make_tokenizer(config.tokenizer, spec.observation)
-    rows, columns = tokenizer.grid
-    players = 2 if spec.two_player else 1
-    tokens = TokenSpec(
-        tokens_per_frame=players * tokenizer.tokens_per_frame,
-        num_codes=tokenizer.num_codes,
-        num_actions=players * spec.num_actions + spec.chance_outcomes,
-        reward_classes=config.world_model.reward_classes or spec.reward_classes,
-        placed=spec.observation.kind == "symbols" and config.world_model.symbol_places,
-        player_actions=spec.num_actions if spec.two_player else 0,
-        chance_outcomes=spec.chance_outcomes,
-        token_size=tokenizer.token_size,
-        spatial=spec.observation.kind != "symbols",
-        content_size=jax.eval_shape(lambda: tokenizer.contents(tokenizer.init(jax.random.key(0)))).shape[1],
-    )
-    return tokenizer, tokens, (players * rows, columns)
 
 
 class Agent:

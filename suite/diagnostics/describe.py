@@ -14,13 +14,13 @@ from typing import Any
 import jax
 from flax import nnx
 
-from suite.agent.dyna import build_tokenizer
 from suite.agent.replay import Replay
 from suite.configuration.overrides import dotted
 from suite.configuration.schema import Config
 from suite.interface.environment import EnvironmentSpec, State
 from suite.policy.actor_critic import make_policy
 from suite.registry import Source
+from suite.tokenizers.stream import build_tokenizer
 from suite.tokenizers.vq_vae import VQState
 from suite.world_model.transformer import WorldModel
 

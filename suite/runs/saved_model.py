@@ -9,7 +9,8 @@ import jax
 from flax import struct
 
 from suite import registry
-from suite.agent.dyna import Agent, TrainState
+from suite.agent.dyna import Agent
+from suite.agent.state import TrainState
 from suite.configuration.schema import CheckpointConfig, Config, EvaluationConfig
 from suite.interface.tokens import TokenizerState
 from suite.policy.ppo import Learner

@@ -15,7 +15,8 @@ import numpy as np
 
 from suite import registry
 from suite.agent.algorithm import iterate, iteration_key, start_key
-from suite.agent.dyna import Agent, TrainState
+from suite.agent.dyna import Agent
+from suite.agent.state import TrainState
 from suite.configuration.schema import Config
 from suite.records import checkpoint
 from suite.records.record import RunRecord, disk_full_is_an_error, run_folder

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import os
-import re
 import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -21,21 +17,27 @@ from suite.commands import sweep as command
 from suite.records.record import RunRecord
 from suite.runs import sweep
 from suite.runs.sweep import Outcome, Process, log_of, plan
+from tests.runs.sweeping import (
+    GRID,
+    alive,
+    finish,
+    finished,
+    just_begun,
+    owner,
+    parent,
+    records,
+    snapshot,
+    sweeping,
+    until,
+)
 
 # JAX fears for forks of its process; Ray's become other programs at once.
-pytestmark = pytest.mark.filterwarnings(r"ignore:os\.fork\(\) was called:RuntimeWarning")
+pytestmark = [
+    pytest.mark.usefixtures("elsewhere"),
+    pytest.mark.filterwarnings(r"ignore:os\.fork\(\) was called:RuntimeWarning"),
+]
 
-TASKS = "openspiel/tic_tac_toe,openspiel/kuhn_poker"
-GRID = ["--tasks", TASKS, "--agents", "random,mfrl_no_rnn", "--seeds", "0-1", "--preset", "smoke"]
 ONE = ["--tasks", "openspiel/tic_tac_toe", "--agents", "random", "--preset", "smoke"]
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
-    """Commands run in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(Path(cli.__file__).parents[1]))
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
 
 
 @pytest.fixture
@@ -47,83 +49,6 @@ def suite(capsys):
         return code, *capsys.readouterr()
 
     return swept
-
-
-@contextlib.contextmanager
-def sweeping(*words):
-    """A sweep as a process of its own; `finish` ends it in peace."""
-    with open("stdout", "w") as out, open("stderr", "w") as err:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "suite.cli", "sweep", *words, "--json"], stdout=out, stderr=err, text=True
-        )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-
-
-def finish(process):
-    """Exit code; the runs, by folder, as the last line has them."""
-    code = process.wait(timeout=400)
-    text = Path("stdout").read_text()
-    assert text, Path("stderr").read_text()
-    return code, {Path(run["folder"]): run for run in json.loads(text.splitlines()[-1])["runs"]}
-
-
-def until(condition, process=None, seconds=300):
-    """Waits for what the condition finds, as long as the process goes on."""
-    end = time.monotonic() + seconds
-    while not (found := condition()):
-        assert time.monotonic() < end, "waited for too long"
-        assert process is None or process.poll() is None, Path("stderr").read_text()
-        time.sleep(0.05)
-    return found
-
-
-def records():
-    """record.json of all runs, by folder. Looked for at its own depth: deeper folders come and go while runs go on."""
-    paths = Path("runs").glob("*/*/*/*/seed_*/record.json")  # family / game / agent / preset
-    return {path.parent: json.loads(path.read_text()) for path in paths}
-
-
-def finished():
-    """Runs that have taken all their steps, and whose process has tidied up and gone."""
-    return {
-        folder for folder, record in records().items() if record["status"] == "finished" and not alive(owner(folder))
-    }
-
-
-def snapshot(folders):
-    """Every file's bytes, and when it was written."""
-    files = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
-    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
-
-
-def owner(folder):
-    """The process that has a run open or had it last."""
-    found = re.match("pid ([0-9]+) ", (folder / "run.lock").read_text())
-    return int(found[1]) if found else None
-
-
-def parent(pid):
-    try:
-        return int(re.search(r"^PPid:\s+([0-9]+)", Path(f"/proc/{pid}/status").read_text(), re.MULTILINE)[1])
-    except OSError:  # it is gone
-        return None
-
-
-def alive(pid):
-    return parent(pid) is not None
-
-
-def just_begun():
-    """Runs that have a record and no iteration yet: seconds before they can finish."""
-    return [
-        folder
-        for folder, record in records().items()
-        if record["status"] == "running" and not (folder / "metrics.csv").exists() and owner(folder)
-    ]
 
 
 # What is refused.
@@ -323,20 +248,20 @@ def test_stopping_and_killing(processed):
 
 
 def test_a_sweep_that_was_killed_does_what_is_missing():
-    with sweeping(*GRID, "--jobs", "2") as first:
+    with sweeping(*GRID, "--seeds", "0-1", "--jobs", "2") as first:
         (cut_off, *_) = until(lambda: finished() and just_begun(), first)
         children = [int(path.name) for path in Path("/proc").glob("[0-9]*") if parent(path.name) == first.pid]
     assert owner(cut_off) in children
     until(lambda: not any(map(alive, children)), seconds=60)  # nobody is there to stop them: they notice themselves
     before = finished()
-    assert 1 <= len(before) < 8 and cut_off not in before
+    assert 1 <= len(before) < 4 and cut_off not in before
     files = snapshot(before)
-    with sweeping(*GRID, "--jobs", "2") as second:
+    with sweeping(*GRID, "--seeds", "0-1", "--jobs", "2") as second:
         code, runs = finish(second)
     assert code == 0
     assert {folder for folder, run in runs.items() if run["status"] == "already finished"} == before
     assert {folder for folder, run in runs.items() if run["status"] == "finished"} == runs.keys() - before
-    assert len(finished()) == len(runs) == 8
+    assert len(finished()) == len(runs) == 4
     assert snapshot(before) == files
     assert len(records()[cut_off]["resumed"]) == 1
     assert runs[min(before)]["scores"]["episodes"] > 0
@@ -376,39 +301,3 @@ def test_a_run_that_fails_does_not_stop_the_others(suite):
     assert (done["status"], done["steps"], done["seed"]) == ("finished", 96, 1)
     assert "[1/2] openspiel/tic_tac_toe, agent random, seed 0: failed" in err
     assert "[2/2] openspiel/tic_tac_toe, agent random, seed 1: finished, 96/96 steps" in err
-
-
-@pytest.fixture
-def cluster():
-    """Ray with two nodes of one CPU each, on this machine."""
-    pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    sizes = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
-    cluster = Cluster(initialize_head=True, head_node_args={**sizes, "include_dashboard": False})
-    cluster.add_node(**sizes)
-    yield cluster
-    cluster.shutdown()
-
-
-def test_a_cluster_that_loses_a_node_in_the_middle(cluster):
-    (node,) = cluster.worker_nodes
-    raylet = node.all_processes["raylet"][0].process.pid
-
-    def on_node(folder):
-        pid = owner(folder)
-        while pid and pid != raylet:
-            pid = parent(pid)
-        return pid == raylet
-
-    with sweeping(*GRID, "--engine", "ray", "--address", cluster.address) as driver:
-        (cut_off, *_) = until(lambda: finished() and list(filter(on_node, just_begun())), driver)
-        files = snapshot(finished())
-        cluster.remove_node(node, allow_graceful=False)
-        code, runs = finish(driver)
-    assert code == 0, Path("stdout").read_text()
-    assert {run["status"] for run in runs.values()} == {"finished"}
-    assert {folder.resolve() for folder in finished()} == runs.keys() and len(runs) == 8
-    assert files and snapshot(path.parent for path in files if path.name == "record.json") == files
-    assert len(records()[cut_off]["resumed"]) == 1
-    assert log_of(cut_off).read_text().count(": suite run ") == 2
