@@ -11,6 +11,7 @@ from jax.typing import DTypeLike
 
 from suite.configuration.schema import WorldModelConfig
 from suite.interface.tokens import TokenSpec
+from suite.nn.bias import add_bias
 
 NARROWER = 4  # so many times fewer numbers a symbol in `SymbolsHead` than in a token's hidden state
 
@@ -39,7 +40,7 @@ class Head(nnx.Module):
         features = nnx.relu(self.hidden(hidden.reshape(-1, hidden.shape[-1])))
         kernel = self.kernel[...] if more is None else self.kernel[...] + more
         logits = jnp.dot(features, kernel.astype(self.dtype), preferred_element_type=jnp.float32)
-        return (logits + self.bias[...][None]).reshape(*hidden.shape[:-1], logits.shape[-1])
+        return add_bias(logits, self.bias[...]).reshape(*hidden.shape[:-1], logits.shape[-1])
 
 
 class PlaceHead(Head):
