@@ -27,10 +27,6 @@ TRUST = 0.5
 GAMES_TRUST = 0.9
 TRUST_WINDOW = 10  # iterations; on Asterix there are some ten rewards in one
 
-# A share of 0.5 or 0.8 knows less than 0.3: rewards teach more often, but all else in larger and rarer steps.
-EVENT_SHARE = 0.3
-PAID = 31  # more than there are achievements that a policy collects in an episode
-
 # Each part of M6 by name: what it changes of M5.
 PARTS: dict[str, Part] = {
     "correspondence": lambda config: {"world_model.correspondence": True},
@@ -45,8 +41,6 @@ PARTS: dict[str, Part] = {
     "games": lambda config: _patient(config) if config.task.startswith(TWO_PLAYERS) else {},
     "average": lambda config: {"world_model.average": AVERAGE},
     "codes": lambda config: _finer_codes(config) if config.task.startswith("craftax") else {},
-    "events": lambda config: {"world_model.event_share": EVENT_SHARE} if config.task.startswith("craftax") else {},
-    "paid": lambda config: {"world_model.paid": PAID} if config.task.startswith("craftax") else {},
     "trust": lambda config: {"imagination.trust": _trust(config), "imagination.trust_window": TRUST_WINDOW},
 }
 
@@ -54,12 +48,11 @@ PARTS: dict[str, Part] = {
 def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
-    Fifteen parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an
+    Thirteen parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an
     embedding of the tokens around each one, in MinAtar the patches that codes stand for, the action added to every
     token, rewards and ends that are read off every token, the age of every token, another optimizer of the model, which
     in games of two players is slower and surer, dreams with averaged parameters and, in games of two players, without
-    improbable tokens, on Craftax a finer codebook, more lessons of what is rare and the number of rewards that an
-    episode has paid, and no dreams while the model does not foresee rewards.
+    improbable tokens, on Craftax a finer codebook, and no dreams while the model does not foresee rewards.
     """
     return _with_parts(config, PARTS)
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from suite.agent import rollout as play
-from suite.agent.replay import Eventful, Experience, Replay, ReplayState
+from suite.agent.replay import Experience, Replay, ReplayState
 from suite.agent.state import TrainState
 from suite.configuration.schema import Config
 from suite.interface.batching import Batched
@@ -88,11 +88,6 @@ class Agent:
     def ages(self) -> int:
         """The highest age of a token that the world model is told; 0: it is told none."""
         return self.config.world_model.ages if self.config.world_model.enabled and self.tokens.spatial else 0
-
-    @property
-    def paid(self) -> int:
-        """How many of an episode's rewards the world model is told of; 0: of none."""
-        return self.config.world_model.paid if self.config.world_model.enabled and self.tokens.spatial else 0
 
     @property
     def past(self) -> int:
@@ -208,10 +203,6 @@ class Agent:
         config, plan = self.config.world_model, self.config.imagination
         if config.patch_contents and self.tokens.content_size:
             learner = learner.shown(self.tokenizer.contents(tokenizer))
-        replay, eventful = self._counting(replay), None
-        if config.event_share:
-            length = self.ages + config.sequence_length + 1
-            eventful = self.replay.eventful(replay, self.spec.pays, length, skipped=self.ages)
         if learner.measured is not None:
             new = self._measure(learner.dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
             measured = learner.measured + (new - learner.measured) / plan.trust_window
@@ -219,7 +210,7 @@ class Agent:
 
         def update(learner, key):
             sample_key, dropout_key = jax.random.split(key)
-            sequences = self._replayed(tokenizer, replay, sample_key, eventful=eventful)
+            sequences = self._replayed(tokenizer, replay, sample_key)
             learner, metrics = world_model_training.update(
                 config,
                 self.world_model_optimizer,
@@ -244,29 +235,13 @@ class Agent:
             metrics["reward_known"] = world_model_training.known_share(loss, frequency_R)
         return learner, metrics
 
-    def _counting(self, replay: ReplayState) -> ReplayState:
-        """The buffer, which counts the rewards that episodes have paid for a model that is told them."""
-        return self.replay.counting(replay, self.spec.pays) if self.paid else replay
-
     def _replayed(
-        self,
-        tokenizer: TokenizerState,
-        replay: ReplayState,
-        key: jax.Array,
-        recent: int = 0,
-        eventful: Eventful | None = None,
+        self, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array, recent: int = 0
     ) -> world_model_training.Sequences:
-        """A minibatch of replayed sequences of T_WM + 1 frames.
-
-        With `recent`, of those that ended so lately; with `eventful`, of these a share that hold an event.
-        """
+        """A minibatch of replayed sequences of T_WM + 1 frames; with `recent`, of those that ended so lately."""
         config = self.config.world_model
         length = self.ages + config.sequence_length + 1
-        number, weight_B = config.sequences // config.minibatches, None
-        if eventful is None:
-            batch = self.replay.sample(replay, key, number, length, recent)
-        else:
-            batch, weight_B = self.replay.sample_eventful(replay, key, number, length, eventful, config.event_share)
+        batch = self.replay.sample(replay, key, config.sequences // config.minibatches, length, recent)
         tokens_BTL = encode_frame(self.tokenizer, tokenizer, batch.observation, batch.turn)
         age_BTL = ages_of(tokens_BTL, self.ages) if self.ages else None
         batch, tokens_BTL, age_BTL = jax.tree.map(lambda x: x[:, self.ages :], (batch, tokens_BTL, age_BTL))
@@ -279,8 +254,6 @@ class Agent:
             ended_BT=batch.first[:, 1:],
             turn_BT=batch.turn,
             age_BTL=None if age_BTL is None else age_BTL[:, :-1],
-            paid_BT=None if batch.paid is None else batch.paid[:, :-1],
-            weight_B=weight_B,
         )
 
     def _measure(self, params: Any, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array) -> jax.Array:
@@ -316,7 +289,6 @@ class Agent:
         An agent that dreams in the true game has neither `world_model` nor `tokenizer`.
         """
         model = None if world_model is None else nnx.merge(self.world_model_graph, world_model)
-        replay = self._counting(replay)
 
         def update(i, carry):
             learner, total = carry
@@ -372,8 +344,8 @@ class Agent:
             game = Batched(self.batched.environment, plan.num_envs)
             return game.resumed(start.state, start.observation, start.first, start.turn)
         before = jax.tree.map(lambda x: x[len(past.first) - 1 - self.past : -1], past)
-        known = Past(before.observation, before.action, before.turn, before.paid) if self.past else None
-        return self.dream_from(model, tokenizer, start.observation, start.turn, plan.horizon, known, start.paid)
+        known = Past(before.observation, before.action, before.turn) if self.past else None
+        return self.dream_from(model, tokenizer, start.observation, start.turn, plan.horizon, known)
 
     def dream_from(
         self,
@@ -383,7 +355,6 @@ class Agent:
         turn_B: Turn | None,
         horizon: int,
         past: Past | None = None,
-        paid_B: jax.Array | None = None,
     ) -> Dream:
         """The world model as an environment that starts at these frames (Algorithm 4).
 
@@ -393,7 +364,6 @@ class Agent:
           turn_B: whose turn it is there, in a game of two players.
           horizon: steps that it can take.
           past: the `self.past` real frames before these, if there are some to be told of.
-          paid_B: how many rewards their episodes have paid before, for a model that is told them.
         """
         plan = self.config.imagination
         return Dream(
@@ -406,7 +376,6 @@ class Agent:
             observation_BO,
             turn_B,
             past=past,
-            start_paid_B=paid_B,
             context=plan.context,
             min_p=plan.min_p,
         )

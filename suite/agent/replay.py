@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import flashbax as fbx
@@ -35,8 +34,6 @@ class Experience:
       first: bool; the frame opens an episode.
       turn: whose move it was and what was allowed; None for single-agent tasks.
       state: the environment's own state at the frame, for agents that dream in the true game; else None.
-      paid: int32; how many rewards the episode had paid before, of sequences drawn from a buffer that counts them
-        (`Replay.counting`); else None.
     """
 
     observation: jax.Array
@@ -46,20 +43,6 @@ class Experience:
     first: jax.Array
     turn: Turn | None = None
     state: State = None
-    paid: jax.Array | None = None
-
-
-@struct.dataclass
-class Eventful:
-    """Which sequences of one length hold an event, by environment (E) and first step (L), the oldest step first.
-
-    Attributes:
-      holds_EL: bool.
-      rank_N: int32 [E * L]; how many do up to each, so that one of them can be drawn.
-    """
-
-    holds_EL: jax.Array
-    rank_N: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,94 +109,11 @@ class Replay:
     def _sample_recent(self, state: ReplayState, key: jax.Array, batch: int, length: int, recent: int) -> Experience:
         row_key, age_key = jax.random.split(key)
         row_N = jax.random.randint(row_key, (batch,), 0, self.num_envs)
-        age_N = jax.random.randint(age_key, (batch,), 0, jnp.minimum(recent, self._stored(state) - length + 1))
-        return self._sequences(state, row_N, self._stored(state) - length - age_N, length)
-
-    def counting(self, state: ReplayState, pays: Callable[[jax.Array], jax.Array]) -> ReplayState:
-        """The same buffer, whose sequences say how many rewards each episode had paid before.
-
-        Of an episode whose beginning has been overwritten only what is left is counted.
-
-        Args:
-          state: the buffer.
-          pays: tells of rewards, float32 of any shape, which of them count.
-        """
-        chronological = self._chronological(state)
-        paid_EL = pays(chronological.reward).astype(jnp.int32)
-        before_EL = jnp.cumsum(paid_EL, axis=1) - paid_EL
-        # Counts only grow, so the largest at an episode's first frame is that of the running episode's.
-        begun_EL = jax.lax.cummax(jnp.where(chronological.first, before_EL, 0), axis=1)
-        count_EL = jnp.roll(before_EL - begun_EL, self._oldest(state), axis=1)
-        return state.replace(experience=state.experience.replace(paid=count_EL))
-
-    def eventful(
-        self, state: ReplayState, pays: Callable[[jax.Array], jax.Array], length: int, skipped: int = 0
-    ) -> Eventful:
-        """Which sequences hold an event: a step that pays, or one that ends its episode by the rules.
-
-        Args:
-          state: the buffer.
-          pays: as in `counting`.
-          length: of the sequences. The last step does not count: it only says what the others led to.
-          skipped: so many first steps do not count either.
-        """
-        chronological = self._chronological(state)
-        event_EL = (pays(chronological.reward) | chronological.terminated).astype(jnp.int32)
-        before_EL = jnp.pad(jnp.cumsum(event_EL, axis=1), ((0, 0), (1, 0)))
-        first_L = jnp.arange(self.length)
-        count_EL = before_EL[:, (first_L + length - 1) % self.length] - before_EL[:, (first_L + skipped) % self.length]
-        holds_EL = (count_EL > 0) & (first_L + length <= self._stored(state))[None]
-        return Eventful(holds_EL, jnp.cumsum(holds_EL.reshape(-1).astype(jnp.int32)))
-
-    def sample_eventful(
-        self, state: ReplayState, key: jax.Array, batch: int, length: int, eventful: Eventful, share: float
-    ) -> tuple[Experience, jax.Array]:
-        """As `sample`, but a share of the sequences is drawn among those that hold an event.
-
-        Args:
-          state, batch, length: as for `sample`.
-          key: of the draw.
-          eventful: which sequences of this length hold one.
-          share: how many, on average, are drawn among these, in [0, 1).
-
-        Returns:
-          the sequences, and float32 [B]: how much less or more often than by `sample` each of them is drawn, so that
-          means weighed by it are what they are there.
-        """
-        row_key, time_key, which_key, rank_key = jax.random.split(key, 4)
-        row_B = jax.random.randint(row_key, (batch,), 0, self.num_envs)
-        first_B = jax.random.randint(time_key, (batch,), 0, self._stored(state) - length + 1)
-        held = eventful.rank_N[-1]
-        drawn_B = jnp.searchsorted(eventful.rank_N, jax.random.randint(rank_key, (batch,), 1, jnp.maximum(held, 1) + 1))
-        wanted_B = (jax.random.uniform(which_key, (batch,)) < share) & (held > 0)
-        row_B = jnp.where(wanted_B, drawn_B // self.length, row_B)
-        first_B = jnp.where(wanted_B, drawn_B % self.length, first_B)
-        number = (self.num_envs * (self._stored(state) - length + 1)).astype(jnp.float32)
-        among = jnp.where(eventful.holds_EL[row_B, first_B], number / jnp.maximum(held, 1).astype(jnp.float32), 0.0)
-        weight_B = jnp.where(held > 0, 1 / (1 - share + share * among), 1.0)
-        return self._sequences(state, row_B, first_B, length), weight_B
-
-    def _stored(self, state: ReplayState) -> jax.Array:
-        """int32 scalar; steps that are stored of each environment."""
-        return jnp.where(state.is_full, self.length, state.current_index)
-
-    def _oldest(self, state: ReplayState) -> jax.Array:
-        """int32 scalar; where the oldest of them stands."""
-        return jnp.where(state.is_full, state.current_index, 0)
-
-    def _chronological(self, state: ReplayState) -> Experience:
-        """Rewards, ends and first frames [E, L], the oldest step first; the rest is left out."""
-        kept = state.experience
-
-        def turned(x_EL: jax.Array) -> jax.Array:
-            return jnp.roll(x_EL, -self._oldest(state), axis=1)
-
-        return Experience(None, None, turned(kept.reward), turned(kept.terminated), turned(kept.first))  # type: ignore[arg-type]
-
-    def _sequences(self, state: ReplayState, row_B: jax.Array, first_B: jax.Array, length: int) -> Experience:
-        """Sequences [B, T] of these environments; `first_B` counts from the oldest step that is stored."""
-        time_BT = (self._oldest(state) + first_B[:, None] + jnp.arange(length)[None]) % self.length
-        return jax.tree.map(lambda x: x[row_B[:, None], time_BT], state.experience)
+        stored = jnp.where(state.is_full, self.length, state.current_index)
+        age_N = jax.random.randint(age_key, (batch,), 0, jnp.minimum(recent, stored - length + 1))
+        first_N = state.current_index - length - age_N
+        time_NT = (first_N[:, None] + jnp.arange(length)[None]) % self.length
+        return jax.tree.map(lambda x: x[row_N[:, None], time_NT], state.experience)
 
 
 def _no_turn(spec: EnvironmentSpec) -> Turn:

@@ -31,7 +31,7 @@ TRAJECTORIES, STEPS = 160, 20  # N_eval, T_eval
 PAIRS = {"paper": 100_000, "small": 20_000, "smoke": 200}
 VALIDATION = 8  # every so many environments, one is kept for validation; one at least
 SYMBOLS = "symbols"
-VERSION = 2  # of what is kept and how it is drawn
+VERSION = 1  # of what is kept and how it is drawn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,6 @@ class EvaluationSet:
       action: int32 [N, T].
       reward: float32 [N, T].
       terminated, ended: bool [N, T]; an end by the rules; any end.
-      paid: int32 [N, T]; how many rewards the episode had paid before the step.
       symbols: int32 [N, T, R], of the frames that steps led to; R = 0 for a task without symbols.
     """
 
@@ -52,7 +51,6 @@ class EvaluationSet:
     reward: np.ndarray
     terminated: np.ndarray
     ended: np.ndarray
-    paid: np.ndarray
     symbols: np.ndarray
 
     @property
@@ -182,18 +180,13 @@ def collect(agent: Agent, pairs: int, reporter: Reporter) -> tuple[EvaluationSet
     validation_B = np.arange(envs) >= envs - max(1, envs // VALIDATION)
     kept: list[dict[str, np.ndarray]] = []
     shown: list[dict[str, np.ndarray]] = []
-    paid_B = np.zeros(envs, np.int32)
 
     def keep(iteration: int, phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Runs a phase of Algorithm 1; of real play it keeps what is wanted."""
-        nonlocal paid_B
         result = function(*arguments)
         if phase == "collect":
             player, trajectory, log = result
             arrays = _arrays(jax.device_get((trajectory, player.time_step.observation, log)))
-            arrays["paid"], paid_B = paid_before(
-                np.asarray(agent.spec.pays(trajectory.reward_TB)), arrays["ended"], paid_B
-            )
             here = np.sort(drawn[drawn // envs == iteration] % envs)
             for env in here:
                 start = random.integers(length - steps + 1)
@@ -211,15 +204,6 @@ def collect(agent: Agent, pairs: int, reporter: Reporter) -> tuple[EvaluationSet
         reporter.update(taken, "collect", {})
     reporter.stop()
     return EvaluationSet(**_joined(np.stack, kept)), Pairs(**_joined(np.concatenate, shown))
-
-
-def paid_before(pays_TB: np.ndarray, ended_TB: np.ndarray, paid_B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How many rewards each episode had paid before a step, int32 [T, B], and before the step after the last."""
-    counts = []
-    for pays_B, ended_B in zip(pays_TB, ended_TB, strict=True):
-        counts.append(paid_B)
-        paid_B = np.where(ended_B, 0, paid_B + pays_B).astype(np.int32)
-    return np.stack(counts), paid_B
 
 
 def _joined(join: Callable[[list[np.ndarray]], np.ndarray], parts: list[dict[str, np.ndarray]]) -> dict[str, Any]:

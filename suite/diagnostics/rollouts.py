@@ -87,8 +87,7 @@ def imagine(
         frames = real.frames[first : first + CHUNK, : seen + 1]
         action = real.action[first : first + CHUNK, :seen]
         missing = [(0, min(CHUNK, len(real.action)) - len(action))]  # one shape, one compilation
-        paid = real.paid[first : first + CHUNK, :seen]
-        padded = [np.pad(x, missing + [(0, 0)] * (x.ndim - 1), mode="edge") for x in (frames, action, paid)]
+        padded = [np.pad(x, missing + [(0, 0)] * (x.ndim - 1), mode="edge") for x in (frames, action)]
         found = _imagine(agent, world_model, tokenizer, *padded, jax.random.fold_in(key, first))
         *arrays, copied, tokens = (np.asarray(x)[: len(action)] for x in jax.device_get(found))
         copies.append(copied)
@@ -108,7 +107,6 @@ def _imagine(
     tokenizer: TokenizerState,
     frames_NTO: jax.Array,
     action_NT: jax.Array,
-    paid_NT: jax.Array,
     key: jax.Array,
 ) -> tuple[jax.Array, ...]:
     """The fields of `Rollouts` in their order but for the last two: what is copied, and the real frames' tokens.
@@ -118,11 +116,8 @@ def _imagine(
     model = nnx.merge(agent.world_model_graph, world_model)
     context = agent.config.imagination.context
     past, horizon = agent.past, action_NT.shape[1] - agent.past
-    told = paid_NT if agent.paid else None
-    before = None if told is None else told[:, :past].T
-    known = Past(jnp.swapaxes(frames_NTO[:, :past], 0, 1), action_NT[:, :past].T, paid_PB=before) if past else None
-    start_paid_N = None if told is None else told[:, past]
-    dream = agent.dream_from(model, tokenizer, frames_NTO[:, past], None, horizon, known, start_paid_N)
+    known = Past(jnp.swapaxes(frames_NTO[:, :past], 0, 1), action_NT[:, :past].T) if past else None
+    dream = agent.dream_from(model, tokenizer, frames_NTO[:, past], None, horizon, known)
     start, _ = dream.reset(key)
 
     def step(state: Any, inputs: Any) -> Any:
@@ -134,8 +129,7 @@ def _imagine(
     tokens_NTL = agent.tokenizer.encode(tokenizer, frames_NTO)
     read = slice(past - context, -1)
     age_NTL = ages_of(tokens_NTL, agent.ages)[:, read] if agent.ages else None
-    shown_NT = None if told is None else told[:, past - context :]
-    hidden = model(tokens_NTL[:, read], action_NT[:, past - context :], age_BTL=age_NTL, paid_BT=shown_NT)[:, context:]
+    hidden = model(tokens_NTL[:, read], action_NT[:, past - context :], age_BTL=age_NTL)[:, context:]
     tokens_NTL = tokens_NTL[:, past:]
     copied_NT = jnp.zeros(hidden.shape[:2])
     if model.gate_head is not None:

@@ -8,7 +8,6 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
-from suite.interface.environment import nearest_level
 from suite.interface.turns import Turn
 
 TokenizerState = Any  # A tokenizer's own pytree of arrays: parameters, codebook, optimizer.
@@ -49,7 +48,9 @@ class TokenSpec:
 
     def reward_to_class(self, reward: jax.Array) -> jax.Array:
         """int32 index of the level nearest to each reward, ties to the higher level (fidelity note 22)."""
-        return nearest_level(self.reward_classes, reward)
+        levels = jnp.asarray(self.reward_classes, jnp.float32)
+        boundaries = (levels[1:] + levels[:-1]) / 2
+        return jnp.searchsorted(boundaries, reward, side="right").astype(jnp.int32)
 
     def class_to_reward(self, index: jax.Array) -> jax.Array:
         """float32 reward level of each class index."""

@@ -283,8 +283,6 @@ AGENTS = (
             ("games", "whose world model learns games of two players as fast as all else"),
             ("average", "that dreams with the newest parameters"),
             ("codes", "with the codebook of m5 on Craftax"),
-            ("events", "that learns from all replayed steps alike on Craftax"),
-            ("paid", "whose world model does not know on Craftax how many rewards the episode has paid"),
             ("trust", "that dreams whatever its model knows of rewards"),
         )
     ),

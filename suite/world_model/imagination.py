@@ -21,15 +21,13 @@ from suite.world_model.transformer import Cache, WorldModel
 class DreamState:
     """The cache of all blocks before this frame, its tokens (int32 [B, L]) and, in a game, whose turn it is.
 
-    Where the model is told ages, also those of the tokens (int32 [B, L]); where it is told how many rewards the episode
-    has paid before, their number (int32 [B]).
+    Where the model is told ages, also those of the tokens (int32 [B, L]).
     """
 
     cache: Cache
     tokens_BL: jax.Array
     turn_B: Turn | None = None
     age_BL: jax.Array | None = None
-    paid_B: jax.Array | None = None
 
 
 @struct.dataclass
@@ -40,13 +38,11 @@ class Past:
       observation_PBO: uint8.
       action_PB: int32, taken on them, in the player's own numbering.
       turn_PB: whose turns they were; None for single-agent tasks.
-      paid_PB: int32; how many rewards the episodes had paid before, for a model that is told them; else None.
     """
 
     observation_PBO: jax.Array
     action_PB: jax.Array
     turn_PB: Turn | None = None
-    paid_PB: jax.Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +63,6 @@ class Dream:
       start_observation_BO: uint8; real frames. Callers that know what came before them burn the policy's memory in.
       start_turn_B: whose turn it is there; None for single-agent tasks.
       past: real steps before them, at least as many as the context and, to tell ages by, as the model's highest age.
-      start_paid_B: int32; how many rewards the episodes have paid before, for a model that is told them; else None.
       context: how many of the last of these the model reads; 0: its view begins with the start frames (note 24).
       min_p: codes less likely than this share of the likeliest are not drawn.
     """
@@ -81,7 +76,6 @@ class Dream:
     start_observation_BO: jax.Array
     start_turn_B: Turn | None = None
     past: Past | None = None
-    start_paid_B: jax.Array | None = None
     context: int = 0
     min_p: float = 0.0
 
@@ -98,7 +92,7 @@ class Dream:
         never_B = jnp.zeros((self.num_envs,), bool)
         cache, age_BL = self._remember(tokens_BL)
         time_step = _time_step(self.start_observation_BO, jnp.zeros((self.num_envs,), jnp.float32), never_B, turn_B)
-        return DreamState(cache, tokens_BL, turn_B, age_BL, self.start_paid_B), time_step
+        return DreamState(cache, tokens_BL, turn_B, age_BL), time_step
 
     def _remember(self, start_BL: jax.Array) -> tuple[Cache, jax.Array | None]:
         """A cache with room for the dream and what the model reads before its start frames; their tokens' ages."""
@@ -115,8 +109,7 @@ class Dream:
         if self.context:
             read = slice(-self.context, None)
             ages = None if age_BPL is None else age_BPL[:, :-1][:, read]
-            paid_BP = None if self.past.paid_PB is None else self.past.paid_PB.swapaxes(0, 1)[:, read]
-            cache = self.model.remember(cache, tokens_BPL[:, read], action_BP[:, read], ages, paid_BP)
+            cache = self.model.remember(cache, tokens_BPL[:, read], action_BP[:, read], ages)
         return cache, None if age_BPL is None else age_BPL[:, -1]
 
     def step(self, key: jax.Array, state: DreamState, action_B: jax.Array) -> tuple[DreamState, TimeStep]:
@@ -127,30 +120,18 @@ class Dream:
         stream_action_B = action_B if turn_B is None else stream_action(turn_B, action_B)
         valid_K = self.tokenizer.valid_codes(self.tokenizer_state)
         cache, hidden_BSD, tokens_BL = next_frame(
-            token_key,
-            self.model,
-            state.cache,
-            state.tokens_BL,
-            stream_action_B,
-            valid_K,
-            self.min_p,
-            state.age_BL,
-            state.paid_B,
+            token_key, self.model, state.cache, state.tokens_BL, stream_action_B, valid_K, self.min_p, state.age_BL
         )
         reward_class_B = jax.random.categorical(reward_key, self.model.reward_logits(hidden_BSD, seat_B))
         terminated_B = jax.random.categorical(termination_key, self.model.termination_logits(hidden_BSD)) == 1
         observation_BO, theirs_BO = decode_frame(self.tokenizer, self.tokenizer_state, tokens_BL, seat_B)
         if seat_B is not None and theirs_BO is not None:
             turn_B = next_turn(jax.random.fold_in(key, 3), self.model.turn_logits(hidden_BSD), seat_B, theirs_BO)
-        reward_B = self.tokens.class_to_reward(reward_class_B)
-        time_step = _time_step(observation_BO, reward_B, terminated_B, turn_B)
+        time_step = _time_step(observation_BO, self.tokens.class_to_reward(reward_class_B), terminated_B, turn_B)
         age_BL = state.age_BL
         if age_BL is not None:
             age_BL = next_ages(age_BL, state.tokens_BL, tokens_BL, self.model.ages)
-        paid_B = state.paid_B
-        if paid_B is not None:
-            paid_B = jnp.where(terminated_B, 0, paid_B + self.spec.pays(reward_B).astype(jnp.int32))
-        return DreamState(cache, tokens_BL, turn_B, age_BL, paid_B), time_step
+        return DreamState(cache, tokens_BL, turn_B, age_BL), time_step
 
 
 def next_frame(
@@ -162,10 +143,9 @@ def next_frame(
     valid_K: jax.Array,
     min_p: float = 0.0,
     age_BL: jax.Array | None = None,
-    paid_B: jax.Array | None = None,
 ) -> tuple[Cache, jax.Array, jax.Array]:
     """The cache with this frame and action, their hidden states [B, S, D], and the next frame's tokens [B, L]."""
-    cache, hidden_BSD = model.step(cache, tokens_BL, action_B, age_BL, paid_B)
+    cache, hidden_BSD = model.step(cache, tokens_BL, action_B, age_BL)
     if not model.config.block_teacher_forcing:
         next_BL, _ = sample_one_by_one(key, model, cache, hidden_BSD[:, -1], valid_K)
     elif model.token_size:

@@ -52,8 +52,6 @@ class Sequences:
       ended_BT: bool; terminated or truncated; None: terminated. Only `mask_after_done` looks at it.
       turn_BT: whose turn it is at each of the T + 1 frames; None for single-agent tasks.
       age_BTL: int32 [B, T, L]; ages of all tokens but the last frame's, for a model that is told them; else None.
-      paid_BT: int32; how many rewards the episode had paid before, for a model that is told them; else None.
-      weight_B: float32; of what each sequence's rewards and ends teach, 1 on average. None: 1.
     """
 
     tokens_BTL: jax.Array
@@ -63,8 +61,6 @@ class Sequences:
     ended_BT: jax.Array | None = None
     turn_BT: Turn | None = None
     age_BTL: jax.Array | None = None
-    paid_BT: jax.Array | None = None
-    weight_B: jax.Array | None = None
 
 
 @struct.dataclass
@@ -160,7 +156,7 @@ def losses(
     frame, following = sequences.tokens_BTL[:, :-1], sequences.tokens_BTL[:, 1:]
     step_weight_BT, token_weight_BT = _weights(sequences, config.mask_after_done)
     if config.block_teacher_forcing:
-        hidden_BTSD = model(frame, sequences.action_BT, dropout_key, sequences.age_BTL, sequences.paid_BT)
+        hidden_BTSD = model(frame, sequences.action_BT, dropout_key, sequences.age_BTL)
         target_BTL, before_BTL = following, frame
         weight_BTL = jnp.broadcast_to(token_weight_BT[..., None], frame.shape[:3])
         token_loss_BTL, correct_BTL, copied_BTL = _token_losses(model, hidden_BTSD, target_BTL, frame)
@@ -189,18 +185,13 @@ def losses(
     termination_loss_BT, _ = cross_entropy(
         model.termination_logits(hidden_BTSD), sequences.terminated_BT.astype(jnp.int32)
     )
-
-    def weighed(value_BT: jax.Array) -> jax.Array:
-        """Not divided by the weights' sum: that would weigh the sequences of one minibatch against each other alone."""
-        return value_BT if sequences.weight_B is None else value_BT * sequences.weight_B[:, None]
-
     metrics = {
         "observation_loss": _mean(token_loss_BTL, weight_BTL),
         "token_accuracy": _mean(correct_BTL, weight_BTL),
         "changed_token_accuracy": _mean(correct_BTL, weight_BTL * changed_BTL.astype(jnp.float32)),
-        "reward_loss": _mean(weighed(reward_loss_BT), step_weight_BT),
-        "reward_accuracy": _mean(weighed(reward_correct_BT), step_weight_BT),
-        "termination_loss": _mean(weighed(termination_loss_BT), step_weight_BT),
+        "reward_loss": _mean(reward_loss_BT, step_weight_BT),
+        "reward_accuracy": _mean(reward_correct_BT, step_weight_BT),
+        "termination_loss": _mean(termination_loss_BT, step_weight_BT),
     }
     if model.gate_head is not None:
         metrics["copied_share"] = _mean(copied_BTL, weight_BTL)

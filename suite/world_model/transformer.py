@@ -138,8 +138,6 @@ class WorldModel(nnx.Module):
         self.termination_places = _place_head(config, tokens, TERMINATION_CLASSES, self.dtype, rngs)
         self.ages = config.ages if tokens.spatial else 0
         self.age_embedding = nnx.Embed(self.ages + 1, width, embedding_init=init, rngs=rngs) if self.ages else None
-        self.paid = config.paid if tokens.spatial else 0
-        self.paid_embedding = nnx.Embed(self.paid + 1, width, embedding_init=init, rngs=rngs) if self.paid else None
         # What codes stand for, and what embeddings and logits make of it: nothing before training.
         content = tokens.content_size if config.patch_contents else 0
         self.contents = Contents(jnp.zeros((codes, content), jnp.float32)) if content else None
@@ -155,18 +153,16 @@ class WorldModel(nnx.Module):
         action_BT: jax.Array,
         dropout_key: jax.Array | None = None,
         age_BTL: jax.Array | None = None,
-        paid_BT: jax.Array | None = None,
     ) -> jax.Array:
         """Hidden states [B, T, S, D] (float32) of whole sequences; without `dropout_key` nothing is dropped.
 
-        Here and below, `age_BTL` are the tokens' ages and `paid_BT` how many rewards the episode has paid before each
-        step, for a model that is told them.
+        Here and below, `age_BTL` are the tokens' ages, for a model that is told them.
         """
         batch, steps = action_BT.shape
         rate = self.config.dropout
         embedding_key, layer_key = _split(dropout_key, 2)
         # All tokens along one axis: on a CPU, a bias's gradient, a sum over two axes, takes several times as long.
-        x = self._embed(tokens_BTL, action_BT, age_BTL, paid_BT).reshape(batch * steps * self.block, -1)
+        x = self._embed(tokens_BTL, action_BT, age_BTL).reshape(batch * steps * self.block, -1)
         position_SA = self._positions(jnp.arange(steps * self.block))
         graphdef, layers = nnx.split(self.layers)
 
@@ -269,26 +265,16 @@ class WorldModel(nnx.Module):
         return Cache(jnp.zeros(shape, self.dtype), jnp.zeros(shape, self.dtype), jnp.int32(0))
 
     def step(
-        self,
-        cache: Cache,
-        tokens_BL: jax.Array,
-        action_B: jax.Array,
-        age_BL: jax.Array | None = None,
-        paid_B: jax.Array | None = None,
+        self, cache: Cache, tokens_BL: jax.Array, action_B: jax.Array, age_BL: jax.Array | None = None
     ) -> tuple[Cache, jax.Array]:
         """Appends one block to the cache; its hidden states [B, S, D] equal those of the whole sequence's pass."""
-        return self._append(cache, self._embed(tokens_BL, action_B, age_BL, paid_B))
+        return self._append(cache, self._embed(tokens_BL, action_B, age_BL))
 
     def remember(
-        self,
-        cache: Cache,
-        tokens_BCL: jax.Array,
-        action_BC: jax.Array,
-        age_BCL: jax.Array | None = None,
-        paid_BC: jax.Array | None = None,
+        self, cache: Cache, tokens_BCL: jax.Array, action_BC: jax.Array, age_BCL: jax.Array | None = None
     ) -> Cache:
         """Appends C blocks to the cache, all at once."""
-        x_BCSD = self._embed(tokens_BCL, action_BC, age_BCL, paid_BC)
+        x_BCSD = self._embed(tokens_BCL, action_BC, age_BCL)
         cache, _ = self._append(cache, x_BCSD.reshape(len(x_BCSD), -1, x_BCSD.shape[-1]))
         return cache
 
@@ -337,7 +323,7 @@ class WorldModel(nnx.Module):
             return None
         return jax.lax.stop_gradient(self.contents[...]) @ reading[...]
 
-    def _embed(self, tokens: jax.Array, action: jax.Array, age: jax.Array | None, paid: jax.Array | None) -> jax.Array:
+    def _embed(self, tokens: jax.Array, action: jax.Array, age: jax.Array | None) -> jax.Array:
         if self.codes_per_place:
             places = self.codes_per_place * jnp.arange(tokens.shape[-1])
             tokens = tokens + places.reshape((1,) * (tokens.ndim - 1) + (-1,))
@@ -350,10 +336,7 @@ class WorldModel(nnx.Module):
             x = x + self.token_action_embedding(action)[..., None, :]
         if self.age_embedding is not None and age is not None:
             x = x + self.age_embedding(age)
-        x = jnp.concatenate([x, self.action_embedding(action)[..., None, :]], axis=-2)
-        if self.paid_embedding is not None and paid is not None:
-            x = x + self.paid_embedding(jnp.minimum(paid, self.paid))[..., None, :]
-        return x
+        return jnp.concatenate([x, self.action_embedding(action)[..., None, :]], axis=-2)
 
 
 def _place_head(

@@ -46,7 +46,6 @@ def real():
         reward=REWARD,
         terminated=ENDED,
         ended=ENDED,
-        paid=np.zeros((3, 3), np.int32),
         symbols=read(frames[:, 1:]),
     )
 
