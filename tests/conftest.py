@@ -33,6 +33,29 @@ def drop_compiled_programs():
     jax.clear_caches()
 
 
+# Files that take longest, which begin first, so that the last of them does not keep one process busy alone.
+LONGEST = (
+    "adapters/craftax/test_craftax_full.py",
+    "baselines/test_agents_run.py",
+    "runs/test_sweep.py",
+    "adapters/openspiel/test_openspiel.py",
+    "adapters/openspiel/test_host.py",
+    "runs/test_training.py",
+    "adapters/gymnasium/test_gymnasium.py",
+    "adapters/craftax/test_craftax.py",
+    "test_contract.py",
+    "world_model/test_imagination.py",
+    "runs/test_sweep_ray.py",
+)
+
+
+def pytest_collection_modifyitems(items):
+    """The same order in every process: whole files, the longest first, the others as they were found."""
+    here = Path(__file__).parent
+    rank = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.relative_to(here).as_posix(), len(LONGEST)))
+
+
 # Tests of these run small programs for a moment, so that compiling them is most of the time. What is compiled as for
 # users is tested by the rest: games, whole commands in processes of their own, the page.
 HASTY = (

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 REPOSITORY = Path(__file__).parents[1]
@@ -34,3 +36,54 @@ def test_every_fidelity_note_that_is_cited_is_written_down():
         for numbers in re.findall(r"\b[Nn]otes? ([0-9]+(?:(?:, | and )[0-9]+)*)", path.read_text()):
             cited |= dict.fromkeys(re.findall("[0-9]+", numbers), path.name)
     assert len(cited) > 20 and not {number: name for number, name in cited.items() if number not in written}
+
+
+def board(task, metric):
+    """Our rows under `small` by agent: mean and standard error, as documents write them; and what was published."""
+    rows = pd.read_csv(REPOSITORY / "leaderboards" / f"{task.replace('/', '_')}.csv", keep_default_na=False)
+    rows = rows[(rows.metric == metric) & (rows.overrides == "")]
+    small = rows[(rows.preset == "small") & (rows["rank"] != "") | (rows.method == "oracle") & (rows.preset == "small")]
+    return {row.agent: f"{float(row.value):.2f} +- {float(row.error):.2f}" for row in small.itertuples()}
+
+
+def table(document, begins):
+    """The cells of the first table whose heading begins so, by the name in the first column."""
+    lines = (REPOSITORY / document).read_text().splitlines()
+    start = next(index for index, line in enumerate(lines) if line.startswith(begins))
+    heading = [cell.replace("`", "").strip() for cell in lines[start].split("|")[1:-1]]
+    rows = itertools.takewhile(lambda line: line.startswith("|"), lines[start + 2 :])
+    cells = [[cell.replace("`", "").strip() for cell in row.split("|")[1:-1]] for row in rows]
+    return {first: dict(zip(heading[1:], rest, strict=True)) for first, *rest in cells}
+
+
+def test_what_readme_says_was_measured_is_on_the_boards():
+    found = table("README.md", "| agent | what it is |")
+    boards = {
+        "measured, small: Craftax-classic": board("craftax_classic", "reward_percent"),
+        "Breakout": board("minatar/breakout", "return"),
+        "tic-tac-toe": board("openspiel/tic_tac_toe", "return"),
+    }
+    shown = {(agent, name): row[name] for agent, row in found.items() for name in boards if row[name]}
+    assert len(shown) >= 15
+    assert shown == {(agent, name): boards[name][agent] for agent, name in shown}
+
+
+def test_what_readme_says_was_published_is_in_the_table_of_that():
+    rows = pd.read_csv(REPOSITORY / "leaderboards" / "published.csv", keep_default_na=False)
+    rows = rows[(rows.task == "craftax_classic") & (rows.metric == "reward_percent") & (rows.agent != "")]
+    published = {row.agent: f"{float(row.value):.2f} +- {float(row.error):.2f}" for row in rows.itertuples()}
+    shown = {
+        agent: row["published: Craftax-classic, 1M steps"]
+        for agent, row in table("README.md", "| agent | what").items()
+    }
+    shown = {agent: value for agent, value in shown.items() if value}
+    assert len(shown) >= 6
+    assert shown == {agent: published[agent] for agent in shown}
+
+
+def test_the_table_of_measured_performance_is_the_boards():
+    shown = table("docs/performance.md", "| task | `random` |")
+    assert len(shown) == 8
+    for task, row in shown.items():
+        rows = board(task, "reward_percent" if task.startswith("craftax") else "return")
+        assert row == {agent: rows[agent] for agent in row}
