@@ -85,7 +85,7 @@ def uninterrupted(tmp_path_factory):
 def assert_same(result, uninterrupted):
     assert result.status == "finished"
     assert files(result.folder) == files(uninterrupted.folder)
-    mine_and_theirs = (last_model(training.folder) for run in (result, uninterrupted))
+    mine_and_theirs = (last_model(run.folder) for run in (result, uninterrupted))
     for mine, theirs in zip(*mine_and_theirs, strict=True):
         np.testing.assert_array_equal(mine, theirs)
     assert result.scores == uninterrupted.scores

@@ -294,7 +294,7 @@ def test_making_reports_progress(tmp_path, monkeypatch):
 
 def test_the_specification_loads_no_engine():
     code = (
-        "import sys; from adapters import openspiel; specs = [openspiel.spec(name) for name in openspiel.GAMES];"
+        "import sys; from adapters.openspiel.task import GAMES, spec; specs = [spec(name) for name in GAMES];"
         "sys.exit('pyspiel' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
