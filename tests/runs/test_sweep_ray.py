@@ -39,14 +39,14 @@ def test_a_cluster_that_loses_a_node_in_the_middle(cluster):
             pid = parent(pid)
         return pid == raylet
 
-    with sweeping(*GRID, "--seeds", "0-1", "--engine", "ray", "--address", cluster.address) as driver:
+    with sweeping(*GRID, "--seeds", "0-2", "--engine", "ray", "--address", cluster.address) as driver:
         (cut_off, *_) = until(lambda: finished() and list(filter(on_node, just_begun())), driver)
         files = snapshot(finished())
         cluster.remove_node(node, allow_graceful=False)
         code, runs = finish(driver)
     assert code == 0, Path("stdout").read_text()
     assert {run["status"] for run in runs.values()} == {"finished"}
-    assert {folder.resolve() for folder in finished()} == runs.keys() and len(runs) == 4
+    assert {folder.resolve() for folder in finished()} == runs.keys() and len(runs) == 6
     assert files and snapshot(path.parent for path in files if path.name == "record.json") == files
     assert len(records()[cut_off]["resumed"]) == 1
     assert log_of(cut_off).read_text().count(": suite run ") == 2
