@@ -35,17 +35,20 @@ def drop_compiled_programs():
 
 # Files that take longest, which begin first, so that the last of them does not keep one process busy alone.
 LONGEST = (
-    "adapters/craftax/test_craftax_full.py",
     "baselines/test_agents_run.py",
-    "runs/test_sweep.py",
-    "adapters/openspiel/test_openspiel.py",
-    "adapters/openspiel/test_host.py",
+    "adapters/craftax/test_craftax_full.py",
     "runs/test_training.py",
-    "adapters/gymnasium/test_gymnasium.py",
-    "adapters/craftax/test_craftax.py",
     "test_contract.py",
+    "runs/test_sweep.py",
     "world_model/test_imagination.py",
+    "test_gpu_script.py",
+    "policy/test_ppo.py",
+    "adapters/craftax/test_craftax.py",
     "runs/test_sweep_ray.py",
+    "adapters/openspiel/test_openspiel.py",
+    "diagnostics/test_rules.py",
+    "diagnostics/test_inspection.py",
+    "adapters/openspiel/test_host.py",
 )
 
 

@@ -16,9 +16,9 @@ def _game(name: str, summary: str = "", cost: str = "") -> TaskEntry:
         make=Lazy("adapters.openspiel.task:make", (name,)),
         scores=Lazy("leaderboards.scoring:games"),
         presets={
-            "paper": Lazy("baselines.presets:openspiel_paper"),
-            "small": Lazy("baselines.presets:openspiel_small"),
-            "smoke": Lazy("baselines.presets:openspiel_smoke"),
+            "paper": Lazy("baselines.presets.openspiel:openspiel_paper"),
+            "small": Lazy("baselines.presets.openspiel:openspiel_small"),
+            "smoke": Lazy("baselines.presets.openspiel:openspiel_smoke"),
         },
         cost=cost,
     )
@@ -33,9 +33,9 @@ def _minatar(name: str, summary: str, cost: str = "small on one CPU core: m5 4 m
         make=Lazy("adapters.minatar:make", (name,)),
         scores=Lazy("leaderboards.scoring:returns"),
         presets={
-            "paper": Lazy("baselines.presets:minatar_paper"),
-            "small": Lazy("baselines.presets:minatar_small"),
-            "smoke": Lazy("baselines.presets:minatar_smoke"),
+            "paper": Lazy("baselines.presets.minatar:minatar_paper"),
+            "small": Lazy("baselines.presets.minatar:minatar_small"),
+            "smoke": Lazy("baselines.presets.minatar:minatar_smoke"),
         },
         cost=cost,
     )
@@ -50,8 +50,8 @@ def _foreign(family: str, name: str, scores: str) -> TaskEntry:
         make=Lazy(f"adapters.{family}.task:make", (name,)),
         scores=Lazy(f"leaderboards.scoring:{scores}"),
         presets={
-            "small": Lazy("baselines.presets:foreign_small"),
-            "smoke": Lazy("baselines.presets:foreign_smoke"),
+            "small": Lazy("baselines.presets.foreign:foreign_small"),
+            "smoke": Lazy("baselines.presets.foreign:foreign_smoke"),
         },
         cost="",
     )
@@ -97,9 +97,9 @@ TASKS = (
         make=Lazy("adapters.craftax.task:make_classic"),
         scores=Lazy("leaderboards.scoring:craftax"),
         presets={
-            "paper": Lazy("baselines.presets:paper"),
-            "small": Lazy("baselines.presets:craftax_classic_small"),
-            "smoke": Lazy("baselines.presets:craftax_classic_smoke"),
+            "paper": Lazy("baselines.presets.craftax:paper"),
+            "small": Lazy("baselines.presets.craftax:craftax_classic_small"),
+            "smoke": Lazy("baselines.presets.craftax:craftax_classic_smoke"),
         },
         own_auto_reset=Lazy("adapters.craftax.task:classic_built_in_auto_reset"),
         symbols=Lazy("adapters.craftax.symbols:classic_symbols"),
@@ -114,9 +114,9 @@ TASKS = (
         make=Lazy("adapters.craftax.task:make_full"),
         scores=Lazy("leaderboards.scoring:craftax"),
         presets={
-            "paper": Lazy("baselines.presets:craftax_full_paper"),
-            "small": Lazy("baselines.presets:craftax_full_small"),
-            "smoke": Lazy("baselines.presets:craftax_full_smoke"),
+            "paper": Lazy("baselines.presets.craftax:craftax_full_paper"),
+            "small": Lazy("baselines.presets.craftax:craftax_full_small"),
+            "smoke": Lazy("baselines.presets.craftax:craftax_full_smoke"),
         },
         own_auto_reset=Lazy("adapters.craftax.task:full_built_in_auto_reset"),
         cost="compiles for 1 min at first; small on one CPU core: m5 10 min, mfrl 5, 3.5 GiB; paper: an accelerator",

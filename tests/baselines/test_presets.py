@@ -348,6 +348,12 @@ def test_craftax_full_s_model_free_agents_are_those_without_a_model(agent):
     assert config.replay.capacity == (48_000 if config.dreams else 128_000)
 
 
+def test_another_distribution_s_agent_without_a_model_gets_the_sizes_of_those(monkeypatch):
+    theirs = registry.AgentEntry("theirs", registry.Lazy("baselines.model_free:mfrl"), "plays for itself")
+    monkeypatch.setattr(registry, "AGENTS", (*registry.AGENTS, theirs))
+    assert registry.resolve("craftax_full", "theirs", "paper").environment.num_envs == 64
+
+
 @pytest.mark.parametrize("game", ["asterix", "breakout", "freeway", "seaquest", "space_invaders"])
 def test_minatar_differs_from_craftax_in_what_the_paper_says_and_in_nothing_else(game):
     """Tables "MFRL changes for MinAtar" and "MBRL changes for MinAtar"."""
