@@ -12,8 +12,8 @@ from tests.tiny import WIDE_CORRIDOR
 
 # Of these each setting runs in another agent, and test_presets says which settings those are. What m6 lacks without one
 # of its parts, m5 lacks too. m2 is m1 that learns as m5 does, m4 and m5_no_btf are m3 with the tokens of m5, m5_no_nnt
-# is m5 with those of m3, m5_no_nnt_no_patches with those of m1, and m5_no_dyna learns as m1 does. The others differ from
-# m5 or mfrl in numbers.
+# is m5 with those of m3, m5_no_nnt_no_patches with those of m1, and m5_no_dyna learns as m1 does. The others differ
+# from m5 or mfrl in numbers.
 ALIKE = {agent for agent in registry.agents() if agent.startswith("m6_no_")}
 ALIKE |= {
     "m2",
