@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from suite.interface.environment import EnvironmentSpec, TimeStep
 from suite.interface.tokens import Tokenizer, TokenizerState, TokenSpec, decode_frame, encode_frame
 from suite.interface.turns import CHANCE, Turn, stream_action
 from suite.world_model.ages import ages_of, next_ages
-from suite.world_model.heads import TurnLogits, filled_odds
+from suite.world_model.heads import TurnLogits
 from suite.world_model.transformer import Cache, WorldModel
 
 
@@ -146,65 +145,8 @@ def next_frame(
 ) -> tuple[Cache, jax.Array, jax.Array]:
     """The cache with this frame and action, their hidden states [B, S, D], and the next frame's tokens [B, L]."""
     cache, hidden_BSD = model.step(cache, tokens_BL, action_B, age_BL)
-    if not model.config.block_teacher_forcing:
-        next_BL, _ = sample_one_by_one(key, model, cache, hidden_BSD[:, -1], valid_K)
-    elif model.token_size:
-        next_BL = jnp.clip(model.observation_logits(hidden_BSD), 0, 1)  # a regression's only guess
-    else:
-        next_BL = draw(key, model.token_odds(hidden_BSD, tokens_BL, valid_K), min_p)
+    next_BL = model.factorization.sample(key, model, cache, hidden_BSD, tokens_BL, valid_K, min_p)
     return cache, hidden_BSD, next_BL
-
-
-def sample_one_by_one(
-    key: jax.Array, model: WorldModel, cache: Cache, action_hidden_BD: jax.Array, valid_K: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """The next frame's tokens, int32 [B, L], each given those before it, and their log-probabilities [B, L] (Eq. 2).
-
-    The tokens enter a copy of the cache: `model.step` appends them again with the next action, all at once.
-    """
-
-    def sample(key: jax.Array, hidden_BD: jax.Array) -> tuple[jax.Array, jax.Array]:
-        logits_BK = model.code_logits(hidden_BD)
-        token_B1 = draw(key, filled_odds(logits_BK[:, None], valid_K))
-        log_BK = jax.nn.log_softmax(jnp.where(valid_K[None], logits_BK, -jnp.inf))
-        return token_B1[:, 0], jnp.take_along_axis(log_BK, token_B1, axis=1)[:, 0]
-
-    def following(carry: tuple[Cache, jax.Array], inputs: tuple[jax.Array, jax.Array]) -> Any:
-        (cache, token_B), (key, place) = carry, inputs
-        cache, hidden_BD = model.append_token(cache, token_B, place)
-        token_B, log_probability_B = sample(key, hidden_BD)
-        return (cache, token_B), (token_B, log_probability_B)
-
-    first_key, *_ = keys = jax.random.split(key, model.block - 1)
-    first_B, first_log_B = sample(first_key, action_hidden_BD)
-    _, (token_LB, log_LB) = jax.lax.scan(following, (cache, first_B), (keys[1:], jnp.arange(model.block - 2)))
-    token_BL = jnp.concatenate([first_B[None], token_LB]).swapaxes(0, 1)
-    return token_BL, jnp.concatenate([first_log_B[None], log_LB]).swapaxes(0, 1)
-
-
-def draw(key: jax.Array, probability_BLK: jax.Array, min_p: float = 0.0) -> jax.Array:
-    """int32 [B, L]: every token, in parallel and independently, with these probabilities.
-
-    With `min_p`, codes of less than that share of the likeliest one's probability are left out.
-
-    On a CPU by inverting the cumulative distribution, which takes one random number per token: adding noise to every
-    logit takes K of them, and six times as long (K = 512). Elsewhere the noise is free, and running sums are not.
-    """
-    if min_p:
-        least_BL1 = min_p * probability_BLK.max(-1, keepdims=True)
-        probability_BLK = jnp.where(probability_BLK >= least_BL1, probability_BLK, 0.0)
-    return jax.lax.platform_dependent(key, probability_BLK, cpu=_draw_by_inversion, default=_draw_by_noise)
-
-
-def _draw_by_inversion(key: jax.Array, probability_BLK: jax.Array) -> jax.Array:
-    cumulative_BLK = jnp.cumsum(probability_BLK, axis=-1)
-    # Keep off the very end, where rounding would let the unfilled codes behind the last filled one in.
-    uniform_BL1 = jax.random.uniform(key, (*probability_BLK.shape[:-1], 1)) * (1 - 1e-5)
-    return (cumulative_BLK <= uniform_BL1 * cumulative_BLK[..., -1:]).sum(-1, dtype=jnp.int32)
-
-
-def _draw_by_noise(key: jax.Array, probability_BLK: jax.Array) -> jax.Array:
-    return jax.random.categorical(key, jnp.log(probability_BLK)).astype(jnp.int32)
 
 
 def next_turn(key: jax.Array, logits_B: TurnLogits, seat_B: jax.Array, opponent_observation_BO: jax.Array) -> Turn:

@@ -153,30 +153,12 @@ def losses(
     with `mask_after_done` only what comes before an episode's end counts: all three losses up to it, but not the
     tokens, nor the turn, it leads to.
     """
-    frame, following = sequences.tokens_BTL[:, :-1], sequences.tokens_BTL[:, 1:]
     step_weight_BT, token_weight_BT = _weights(sequences, config.mask_after_done)
-    if config.block_teacher_forcing:
-        hidden_BTSD = model(frame, sequences.action_BT, dropout_key, sequences.age_BTL)
-        target_BTL, before_BTL = following, frame
-        weight_BTL = jnp.broadcast_to(token_weight_BT[..., None], frame.shape[:3])
-        token_loss_BTL, correct_BTL, copied_BTL = _token_losses(model, hidden_BTSD, target_BTL, frame)
-    else:
-        # All tokens of the last frame are predicted (Eq. 2), for a dream needs them: the model reads it too, with an
-        # action that predicts nothing and that nothing sees.
-        whole = sequences.tokens_BTL
-        hidden_BTSD = model(whole, jnp.pad(sequences.action_BT, ((0, 0), (0, 1))), dropout_key)
-        behind = jnp.concatenate([following, whole[:, -1:]], axis=1)
-        target_BTL = model.observation_targets(whole, behind)
-        token_loss_BTL, correct_BTL, copied_BTL = _token_losses(model, hidden_BTSD, target_BTL, whole)
-        hidden_BTSD = hidden_BTSD[:, :-1]
-        # Changed is what differs from the frame before; the first has none.
-        before_BTL = model.observation_targets(jnp.concatenate([whole[:, :1], frame], axis=1), whole)
-        frame_weight_BT = jnp.concatenate([jnp.ones_like(token_weight_BT[:, :1]), token_weight_BT], axis=1)
-        next_weight_BT = jnp.pad(token_weight_BT, ((0, 0), (0, 1)))
-        weight_BTL = model.observation_targets(
-            *(jnp.broadcast_to(weight[..., None], whole.shape) for weight in (frame_weight_BT, next_weight_BT))
-        )
-    changed_BTL = (before_BTL != target_BTL).reshape(*weight_BTL.shape, -1).any(-1)
+    lesson = model.factorization.lesson(sequences, token_weight_BT)
+    hidden_BFSD = model(lesson.frame_BFL, lesson.action_BF, dropout_key, lesson.age_BFL)
+    token_loss_BFL, correct_BFL, copied_BFL = _token_losses(model, hidden_BFSD, lesson.target_BFL, lesson.frame_BFL)
+    changed_BFL = (lesson.before_BFL != lesson.target_BFL).reshape(*lesson.weight_BFL.shape, -1).any(-1)
+    hidden_BTSD = hidden_BFSD[:, : sequences.action_BT.shape[1]]
 
     reward_class_BT = spec.reward_to_class(sequences.reward_BT)
     turn_BT = sequences.turn_BT
@@ -186,15 +168,15 @@ def losses(
         model.termination_logits(hidden_BTSD), sequences.terminated_BT.astype(jnp.int32)
     )
     metrics = {
-        "observation_loss": _mean(token_loss_BTL, weight_BTL),
-        "token_accuracy": _mean(correct_BTL, weight_BTL),
-        "changed_token_accuracy": _mean(correct_BTL, weight_BTL * changed_BTL.astype(jnp.float32)),
+        "observation_loss": _mean(token_loss_BFL, lesson.weight_BFL),
+        "token_accuracy": _mean(correct_BFL, lesson.weight_BFL),
+        "changed_token_accuracy": _mean(correct_BFL, lesson.weight_BFL * changed_BFL.astype(jnp.float32)),
         "reward_loss": _mean(reward_loss_BT, step_weight_BT),
         "reward_accuracy": _mean(reward_correct_BT, step_weight_BT),
         "termination_loss": _mean(termination_loss_BT, step_weight_BT),
     }
     if model.gate_head is not None:
-        metrics["copied_share"] = _mean(copied_BTL, weight_BTL)
+        metrics["copied_share"] = _mean(copied_BFL, lesson.weight_BFL)
     other = metrics["reward_loss"] + metrics["termination_loss"]
     loss = metrics["observation_loss"] + config.reward_weight * other
     if turn_BT is not None:

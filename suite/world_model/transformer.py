@@ -1,10 +1,9 @@
 """The transformer world model: a GPT-2 over a stream of blocks [q_1 .. q_L, a] (Section 3.6, Appendix A.2.2).
 
-With block teacher forcing every token sees its whole own block, and the output at q_t^i predicts q_{t+1}^i. Without, a
-token sees itself and what came before, and the outputs at q_t^i and a_t predict q_t^{i+1} and q_{t+1}^1 (fidelity notes
-18 and 19): another mask, another shift of the targets, another sampler (`imagination.next_frame`), nothing else.
-The output at a_t predicts reward and termination, and in a two-player game who is next, what is then legal, and the
-probabilities of chance (Section 4.7, Appendix G).
+Which tokens see one another, and what the output at each of them predicts, is a matter of
+`suite.world_model.factorization`: block teacher forcing, or token by token. The output at a_t predicts reward and
+termination, and in a two-player game who is next, what is then legal, and the probabilities of chance (Section 4.7,
+Appendix G).
 Shapes: B streams, T time steps, L tokens per frame, S = L + 1 tokens per block, D width, N heads, H = D / N. Where
 tokens are no codes but vectors (`TokenSpec.token_size`), arrays of them have a further last axis.
 """
@@ -24,6 +23,7 @@ from suite.interface.tokens import TokenSpec
 from suite.nn.dropout import dropout
 from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
+from suite.world_model.factorization import factorization
 from suite.world_model.heads import Head, PlaceHead, SymbolsHead, TurnHead, TurnLogits, filled_odds
 
 TERMINATION_CLASSES = 2
@@ -96,6 +96,7 @@ class WorldModel(nnx.Module):
 
     Attributes:
       block: S, tokens per time step (the frame's L and the action).
+      factorization: how the next frame's probability is written as a product.
       unit: tokens that see one another: a block, or a token.
       dtype: of the matrix products and the cache; parameters, norms, softmax, residuals and logits are float32.
     """
@@ -104,7 +105,8 @@ class WorldModel(nnx.Module):
         width = config.embed_dim
         self.config, self.grid = config, grid
         self.block = tokens.tokens_per_frame + 1
-        self.unit = self.block if config.block_teacher_forcing else 1
+        self.factorization = factorization(config.block_teacher_forcing)
+        self.unit = self.factorization.unit(self.block)
         self.dtype = jnp.bfloat16 if config.compute_type == "bfloat16" else jnp.float32
         self.codes_per_place = tokens.num_codes if tokens.placed else 0
         codes = tokens.num_codes * (tokens.tokens_per_frame if tokens.placed else 1)
@@ -189,27 +191,16 @@ class WorldModel(nnx.Module):
         return self.norm(x).reshape(batch, steps, self.block, -1)
 
     def observation_logits(self, hidden: jax.Array) -> jax.Array:
-        """float32 [B, T, L, K]: of `observation_targets`, from hidden states [B, T, S, D] (or without the T axis).
+        """float32 [B, T, L, K]: of `factorization.targets`, from hidden states [B, T, S, D] (or without the T axis).
 
         Where tokens are vectors these are the predicted tokens themselves, K numbers each.
         """
-        if self.config.block_teacher_forcing:
-            return self.code_logits(hidden[..., :-1, :])
-        return self.code_logits(jnp.concatenate([hidden[..., :-2, :], hidden[..., -1:, :]], axis=-2))
+        return self.code_logits(self.factorization.predicting(hidden))
 
     def code_logits(self, hidden: jax.Array) -> jax.Array:
         """float32 [..., K]: of one token each, or what it is, from the hidden states [..., D] that predict it."""
         content_KD = self._of_contents(self.content_logits)
         return self.observation_head.logits(hidden, None if content_KD is None else content_KD.T)
-
-    def observation_targets(self, frame: jax.Array, following: jax.Array) -> jax.Array:
-        """What `observation_logits` are of: the following frame, or the rest of this one and that one's first token.
-
-        Arguments and result: [..., L], of tokens or of anything else that there is one of for each.
-        """
-        if self.config.block_teacher_forcing:
-            return following
-        return jnp.concatenate([frame[..., 1:], following[..., :1]], axis=-1)
 
     def reward_logits(self, hidden: jax.Array, seat: jax.Array | None = None) -> jax.Array:
         """float32 [B, T, R]: of the reward's class, from hidden states [B, T, S, D] (or without the T axis).
@@ -260,8 +251,8 @@ class WorldModel(nnx.Module):
     def init_cache(self, batch: int, length: int) -> Cache:
         """An empty cache for `length` steps of `batch` streams, and the tokens of the frame that the last leads to."""
         heads, width = self.config.heads, self.config.embed_dim
-        blocks = length if self.config.block_teacher_forcing else length + 1
-        shape = (self.config.layers, batch, heads, blocks * self.block, width // heads)
+        tokens = self.factorization.blocks(length) * self.block
+        shape = (self.config.layers, batch, heads, tokens, width // heads)
         return Cache(jnp.zeros(shape, self.dtype), jnp.zeros(shape, self.dtype), jnp.int32(0))
 
     def step(

@@ -11,10 +11,10 @@ import pytest
 from flax import nnx
 
 from suite.interface.tokens import TokenSpec
+from suite.nn.sampling import draw
 from suite.runtime.errors import UserError
 from suite.world_model import training
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_loss, mixture_odds, neighbourhood
-from suite.world_model.imagination import draw
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import small_config
 

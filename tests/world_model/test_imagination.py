@@ -14,11 +14,12 @@ from flax import nnx
 
 from suite.interface.batching import Batched
 from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
+from suite.nn.sampling import draw
 from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
 from suite.world_model import training
 from suite.world_model.ages import ages_of
 from suite.world_model.heads import filled_odds
-from suite.world_model.imagination import Dream, Past, draw
+from suite.world_model.imagination import Dream, Past
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import SPEC, small_config, small_model
 

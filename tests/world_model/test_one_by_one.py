@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.world_model.imagination import next_frame, sample_one_by_one
+from suite.world_model.factorization import sample_one_by_one
+from suite.world_model.imagination import next_frame
 from suite.world_model.training import losses
 from tests.world_model.small import SPEC, random_sequences, small_config, small_model
 
@@ -95,7 +96,7 @@ def test_masking_after_an_end_keeps_the_frame_that_led_to_it():
     frames = sequences.tokens_BTL
     logits = model.observation_logits(model(frames, jnp.pad(sequences.action_BT, ((0, 0), (0, 1)))))
     behind = jnp.concatenate([frames[:, 1:], frames[:, :1]], axis=1)
-    loss = nats(logits, model.observation_targets(frames, behind))
+    loss = nats(logits, model.factorization.targets(frames, behind))
     weight = np.ones((4, 6, 6))
     weight[0, 1, 5] = weight[0, 2:] = weight[:, 5, 5] = 0
     np.testing.assert_allclose(metrics["observation_loss"], (loss * weight).sum() / weight.sum(), rtol=1e-5)

@@ -76,7 +76,7 @@ def test_causality_without_block_teacher_forcing():
     np.testing.assert_array_equal(
         seen_by(lambda model, hidden: model.reward_logits(hidden)[0, time, 1])[0].ravel(), np.arange(5 * 7) < 3 * 7
     )
-    targets = model.observation_targets(TOKENS[:, :-1], TOKENS[:, 1:])
+    targets = model.factorization.targets(TOKENS[:, :-1], TOKENS[:, 1:])
     np.testing.assert_array_equal(targets[:, :, :5], TOKENS[:, :-1, 1:])
     np.testing.assert_array_equal(targets[:, :, 5], TOKENS[:, 1:, 0])
 
