@@ -168,8 +168,8 @@ def information_sets(tables: Tables, seat: int) -> tuple[np.ndarray, list[Inform
         ours = tables.player_N[node] == seat
         if ours:
             observation_O = tables.observation_2NO[seat - 1, node]
-            found = number_of.setdefault((*last, observation_O.tobytes()), len(known))
-            if found == len(known):
+            number = number_of.setdefault((*last, observation_O.tobytes()), len(known))
+            if number == len(known):
                 before = known[last[0]] if last != start else None
                 known.append(
                     Information(
@@ -179,7 +179,7 @@ def information_sets(tables: Tables, seat: int) -> tuple[np.ndarray, list[Inform
                         tables.next_DA[node - first] >= 0,
                     )
                 )
-            set_D[node - first] = found
+            set_D[node - first] = number
         if node < tables.num_open:
             for event, child in enumerate(tables.successors(node)):
                 if child >= 0:

@@ -92,13 +92,13 @@ def file_name(task: str) -> str:
 
 def ranges(numbers: Iterable[int]) -> str:
     """Whole numbers in order, what follows each other as a range: {0, 1, 2, 5} as "0-2 5"."""
-    found: list[list[int]] = []
+    runs: list[list[int]] = []
     for number in sorted(numbers):
-        if found and number == found[-1][-1] + 1:
-            found[-1].append(number)
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
         else:
-            found.append([number])
-    return " ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in found)
+            runs.append([number])
+    return " ".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
 
 
 def as_csv(board: pd.DataFrame) -> bytes:

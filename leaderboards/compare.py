@@ -14,7 +14,7 @@ from leaderboards.statistics import mean_and_standard_error
 from suite.records.record import RunRecord
 from suite.runtime.errors import UserError, did_you_mean
 
-Spread = tuple[float, float]  # mean and standard error; nan where there is none
+Estimate = tuple[float, float]  # mean and standard error; nan where there is none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,10 +35,10 @@ class Comparison:
     preset: str
     steps: int
     seeds: dict[str, int]
-    scores: dict[str, dict[str, Spread]]
-    minutes: dict[str, Spread]
+    scores: dict[str, dict[str, Estimate]]
+    minutes: dict[str, Estimate]
     curve_of: str
-    curve: dict[str, list[Spread]]
+    curve: dict[str, list[Estimate]]
 
 
 def compare(records: Sequence[RunRecord], parts: int = 5, score: str | None = None) -> list[Comparison]:
@@ -67,16 +67,16 @@ def _compare(entries: list[Entry], parts: int, score: str | None) -> Comparison:
     if curve_of not in names:
         raise UserError(f"{config.task} has no score {curve_of!r}; {did_you_mean(curve_of, names)}")
     by_agent = {entry.config.agent: entry for entry in entries}
-    spread = mean_and_standard_error
+    estimate = mean_and_standard_error
     return Comparison(
         task=config.task,
         preset=config.preset,
         steps=config.total_steps,
         seeds={agent: len(entry.seeds) for agent, entry in by_agent.items()},
-        scores={agent: {name: spread(entry.scores[name]) for name in names} for agent, entry in by_agent.items()},
-        minutes={agent: spread(entry.minutes) for agent, entry in by_agent.items()},
+        scores={agent: {name: estimate(entry.scores[name]) for name in names} for agent, entry in by_agent.items()},
+        minutes={agent: estimate(entry.minutes) for agent, entry in by_agent.items()},
         curve_of=curve_of,
-        curve={agent: [spread(part) for part in entry.curve(curve_of, parts)] for agent, entry in by_agent.items()},
+        curve={agent: [estimate(part) for part in entry.curve(curve_of, parts)] for agent, entry in by_agent.items()},
     )
 
 
@@ -112,7 +112,7 @@ def _label(name: str) -> str:
     return name.replace("_percent", " %").replace("_", " ")
 
 
-def _text(value: Spread) -> str:
+def _text(value: Estimate) -> str:
     mean, error = value
     if math.isnan(mean):
         return "n/a"

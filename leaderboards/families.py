@@ -59,7 +59,7 @@ def families(entries: Sequence[Entry]) -> list[list[FamilyScores]]:
         if config.task in GAMES.get(family, ()) and not overrides(config):
             key = (family, config.preset, *(rules[name] for name in sorted(rules) if name != "task"))
             groups.setdefault(key, {}).setdefault(config.agent, {})[config.task] = entry
-    found = []
+    comparable = []
     for (family, *_), agents in groups.items():
         whole = {
             agent: tuple(played[game] for game in GAMES[family])
@@ -67,8 +67,8 @@ def families(entries: Sequence[Entry]) -> list[list[FamilyScores]]:
             if played.keys() == set(GAMES[family])
         }
         if family != "minatar" or BASELINE in whole:
-            found.append([_scores(family, own, whole.get(BASELINE, ())) for own in whole.values()])
-    return [group for group in found if group]
+            comparable.append([_scores(family, own, whole.get(BASELINE, ())) for own in whole.values()])
+    return [group for group in comparable if group]
 
 
 def _scores(family: str, own: tuple[Entry, ...], baseline: tuple[Entry, ...]) -> FamilyScores:

@@ -124,11 +124,11 @@ def _examined(kept: list[Path], new: list[Path]) -> tuple[list[RunRecord], list[
     records: list[RunRecord] = []
     refusals: list[Refusal] = []
     for folder in (*kept, *new):
-        found = examine(folder)
-        if isinstance(found, Refusal):
-            refusals.append(found)
+        examined = examine(folder)
+        if isinstance(examined, Refusal):
+            refusals.append(examined)
         else:
-            records.append(found)
+            records.append(examined)
     seen: dict[tuple[int, str, str], list[RunRecord]] = {}
     for record in records:
         run = (record.config.seed, hash_of(settings(record.config)), record.fields.protocol_hash)
@@ -180,12 +180,12 @@ def _standings(records: list[RunRecord], out: Path) -> list[Standing]:
 def _differences(path: Path, expected: bytes) -> list[str]:
     """What a CSV file says otherwise, row by row."""
     try:
-        found = path.read_bytes()
+        present = path.read_bytes()
     except OSError as error:
         return [f"cannot be read ({error.strerror})"]
-    if found == expected:
+    if present == expected:
         return []
-    rows, right = (list(csv.reader(io.StringIO(text.decode(errors="replace")))) for text in (found, expected))
+    rows, right = (list(csv.reader(io.StringIO(text.decode(errors="replace")))) for text in (present, expected))
     if rows[:1] != right[:1]:
         return ["the columns are not those of this version: publish again"]
     problems = [] if len(rows) == len(right) else [f"{len(rows) - 1} rows, the evidence gives {len(right) - 1}"]

@@ -54,8 +54,8 @@ class Entry:
     def scores(self) -> dict[str, np.ndarray]:
         """By name, each seed's score [S], computed from its episodes as the task says; counts of episodes left out."""
         score = registry.task(self.config.task).scores()
-        found = [score(record.episodes(), record.config, self.spec) for record in self.records]
-        return {name: np.array([run[name] for run in found], float) for name in found[0] if name not in COUNTS}
+        runs = [score(record.episodes(), record.config, self.spec) for record in self.records]
+        return {name: np.array([run[name] for run in runs], float) for name in runs[0] if name not in COUNTS}
 
     @property
     def main_score(self) -> str:
@@ -70,13 +70,13 @@ class Entry:
     def curve(self, score: str, parts: int) -> np.ndarray:
         """A score over the episodes that end in each of the budget's equal parts, [P, S]; nan where none does."""
         task, budget = registry.task(self.config.task), self.config.protocol.steps
-        found = np.empty((parts, len(self.records)))
+        curve_PS = np.empty((parts, len(self.records)))
         for i, record in enumerate(self.records):
             episodes = record.episodes()
             part = np.ceil(episodes["step"] * parts / budget).astype(int)  # 1 to `parts`
             for j in range(parts):
-                found[j, i] = task.scores()(episodes[part == j + 1], None, self.spec)[score]
-        return found
+                curve_PS[j, i] = task.scores()(episodes[part == j + 1], None, self.spec)[score]
+        return curve_PS
 
 
 def finished_in(folders: Sequence[Path]) -> list[RunRecord]:

@@ -101,9 +101,9 @@ def make_renderer() -> Callable[[Any], jax.Array]:
         light = _view(state.light_map, level, corner, 0.0)
         scene = pixels(tiles * light[..., None, None, None])
 
-        shown = _inventory(state)
+        numbers = _inventory(state)
         index = [
-            start[name] + jnp.clip(jnp.asarray(shown[name]).astype(jnp.int32), 0, last[name])
+            start[name] + jnp.clip(jnp.asarray(numbers[name]).astype(jnp.int32), 0, last[name])
             for row in INVENTORY
             for name in row
         ]
@@ -164,17 +164,17 @@ def _inventory(state: Any) -> dict[str, Any]:
     """What each slot shows: an index into its images (`_slots`)."""
     has = state.inventory
     counts = ["wood", "stone", "coal", "iron", "diamond", "sapphire", "ruby", "sapling", "torches", "books"]
-    shown = {"": 0, "floor": state.player_level, "bow": has.bow, "pickaxe": has.pickaxe}
-    shown |= {name: getattr(has, name) for name in counts}
-    shown |= {name: getattr(state, f"player_{name}") for name in ("food", "drink", "energy", "mana", "xp")}
-    shown |= {name: getattr(state, f"player_{name}") for name in ("dexterity", "strength", "intelligence")}
-    shown["health"] = jnp.maximum(jnp.floor(state.player_health), 1)
-    shown |= {f"potion_{color}": has.potions[i] for i, color in enumerate(POTIONS)}
-    shown |= {name: state.learned_spells[i] for i, name in enumerate(("fireball", "iceball"))}
-    shown |= {name: has.armour[i] + 3 * state.armour_enchantments[i] for i, name in enumerate(ARMOUR)}
-    shown["sword"] = has.sword + 5 * state.sword_enchantment
-    shown["arrows"] = has.arrows + jnp.where(has.arrows > 0, COUNTS * state.bow_enchantment, 0)
-    return shown
+    numbers = {"": 0, "floor": state.player_level, "bow": has.bow, "pickaxe": has.pickaxe}
+    numbers |= {name: getattr(has, name) for name in counts}
+    numbers |= {name: getattr(state, f"player_{name}") for name in ("food", "drink", "energy", "mana", "xp")}
+    numbers |= {name: getattr(state, f"player_{name}") for name in ("dexterity", "strength", "intelligence")}
+    numbers["health"] = jnp.maximum(jnp.floor(state.player_health), 1)
+    numbers |= {f"potion_{color}": has.potions[i] for i, color in enumerate(POTIONS)}
+    numbers |= {name: state.learned_spells[i] for i, name in enumerate(("fireball", "iceball"))}
+    numbers |= {name: has.armour[i] + 3 * state.armour_enchantments[i] for i, name in enumerate(ARMOUR)}
+    numbers["sword"] = has.sword + 5 * state.sword_enchantment
+    numbers["arrows"] = has.arrows + jnp.where(has.arrows > 0, COUNTS * state.bow_enchantment, 0)
+    return numbers
 
 
 def _blocks() -> np.ndarray:

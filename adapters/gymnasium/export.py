@@ -76,8 +76,8 @@ class SuiteEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None or self._key is None:
             self._key = _first_key(self.np_random if seed is None else seed)
-        self._key, self._state, shown = self._reset(self._key)
-        return self._observation(shown), _episode(shown)
+        self._key, self._state, time_step = self._reset(self._key)
+        return self._observation(time_step), _episode(time_step)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One step.
@@ -90,19 +90,19 @@ class SuiteEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded("the episode has ended or none was begun: call reset() first")
         if not self.action_space.contains(action):
             raise gymnasium.error.InvalidAction(f"{action!r} is no action of {self.action_space}")
-        self._key, self._state, shown = self._step(self._key, self._state, np.int32(action))
-        observation = self._observation(shown)
-        terminated, truncated = bool(shown.terminated), bool(shown.truncated)
+        self._key, self._state, time_step = self._step(self._key, self._state, np.int32(action))
+        observation = self._observation(time_step)
+        terminated, truncated = bool(time_step.terminated), bool(time_step.truncated)
         if terminated or truncated:
             self._state = None
-        return observation, float(shown.reward), terminated, truncated, _episode(shown)
+        return observation, float(time_step.reward), terminated, truncated, _episode(time_step)
 
     def render(self) -> Any:
         """The last observation, uint8 [height, width, 3]; None without a render mode."""
         return None if self.render_mode is None or self._frame is None else self._frame.copy()
 
-    def _observation(self, shown: TimeStep) -> np.ndarray:
-        self._frame = _as_in(self.observation_space, shown.observation)
+    def _observation(self, time_step: TimeStep) -> np.ndarray:
+        self._frame = _as_in(self.observation_space, time_step.observation)
         return self._frame
 
 
@@ -156,9 +156,9 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv):
         super().reset(seed=None if seed is None else int(seed))
         if seed is not None or self._key is None:
             self._key = _first_key(self.np_random if seed is None else seed)
-        self._key, self._state, shown = self._reset(self._key)
-        info = _masked(shown.statistics, np.ones(self.num_envs, bool))
-        return _as_in(self.observation_space, shown.observation), info
+        self._key, self._state, time_step = self._reset(self._key)
+        info = _masked(time_step.statistics, np.ones(self.num_envs, bool))
+        return _as_in(self.observation_space, time_step.observation), info
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One step of each; rewards float32 [B], flags bool [B].
@@ -171,18 +171,18 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv):
             raise gymnasium.error.ResetNeeded("no episodes were begun: call reset() first")
         if not self.action_space.contains(np.asarray(actions)):
             raise gymnasium.error.InvalidAction(f"{actions!r} are no actions of {self.action_space}")
-        self._key, self._state, shown = self._step(self._key, self._state, np.asarray(actions, np.int32))
-        ended_B = shown.terminated | shown.truncated
-        info = _masked(shown.statistics, ~ended_B)
+        self._key, self._state, time_step = self._step(self._key, self._state, np.asarray(actions, np.int32))
+        ended_B = time_step.terminated | time_step.truncated
+        info = _masked(time_step.statistics, ~ended_B)
         if ended_B.any():
             final_B = np.full(self.num_envs, None, dtype=object)
-            final_observation_B = _as_in(self.observation_space, shown.final_observation)
+            final_observation_B = _as_in(self.observation_space, time_step.final_observation)
             for index in np.flatnonzero(ended_B):
                 final_B[index] = final_observation_B[index]
             info |= {"final_obs": final_B, "_final_obs": ended_B}
-            info |= {"final_info": _masked(shown.statistics, ended_B), "_final_info": ended_B}
-        observation_B = _as_in(self.observation_space, shown.observation)
-        return observation_B, shown.reward, shown.terminated, shown.truncated, info
+            info |= {"final_info": _masked(time_step.statistics, ended_B), "_final_info": ended_B}
+        observation_B = _as_in(self.observation_space, time_step.observation)
+        return observation_B, time_step.reward, time_step.terminated, time_step.truncated, info
 
 
 def observation_space(spec: ObservationSpec) -> spaces.Space:
@@ -226,8 +226,8 @@ def _programs(environment: Environment, num_envs: int | None = None) -> tuple[Ca
         compiled = jax.jit(program)
 
         def run(*args):
-            key, state, shown = compiled(*args)
-            return key, state, jax.device_get(shown)
+            key, state, time_step = compiled(*args)
+            return key, state, jax.device_get(time_step)
 
         return run
 
@@ -246,9 +246,9 @@ def _as_in(space: spaces.Space, observation: Any) -> np.ndarray:
     return np.array(observation, dtype=space.dtype)  # a copy: what JAX returns cannot be written to
 
 
-def _episode(shown: TimeStep) -> dict[str, Any]:
+def _episode(time_step: TimeStep) -> dict[str, Any]:
     """Statistics as `info`; scalars as Python's."""
-    return {name: value.copy() if value.shape else value.item() for name, value in shown.statistics.items()}
+    return {name: value.copy() if value.shape else value.item() for name, value in time_step.statistics.items()}
 
 
 def _masked(statistics: dict[str, np.ndarray], mask_B: np.ndarray) -> dict[str, Any]:

@@ -33,11 +33,11 @@ HOMES = {"MiniGrid-": "minigrid", "BabyAI-": "minigrid"}
 PAYS = {"minigrid": {0.1, 0.5, 0.9, 1.0}}
 
 
-class Imported(NamedTuple):
+class GymnasiumTask(NamedTuple):
     """An imported environment: what it is, how to make an engine, and after how many steps it is truncated."""
 
     spec: EnvironmentSpec
-    make_engine: Callable[[], Engine]
+    make_engine: Callable[[], GymnasiumEngine]
     limit: int
 
 
@@ -48,7 +48,7 @@ class Seen(NamedTuple):
     encode: Callable[[Any], np.ndarray]
 
 
-class Engine:
+class GymnasiumEngine:
     """A Gymnasium environment as a host engine; see `suite.interface.host.HostEngine`."""
 
     def __init__(self, env: gymnasium.Env, encode: Callable[[Any], np.ndarray]):
@@ -110,7 +110,7 @@ def make(id: str, progress: Callable[[str, float], None] | None = None) -> Envir
 
 
 @functools.lru_cache(maxsize=16)
-def _imported(id: str) -> Imported:
+def _imported(id: str) -> GymnasiumTask:
     from suite.interface.environment import EnvironmentSpec
     from suite.interface.host import LIMIT, random_rewards, reward_classes
 
@@ -128,7 +128,7 @@ def _imported(id: str) -> Imported:
     if table is not None:
         rewards = _paid(table)
     else:
-        rewards = random_rewards(Engine(env, seen.encode), int(actions.n)) | PAYS.get(package, set())
+        rewards = random_rewards(GymnasiumEngine(env, seen.encode), int(actions.n)) | PAYS.get(package, set())
     task = EnvironmentSpec(
         id=f"gymnasium/{id}",
         observation=seen.spec,
@@ -137,7 +137,7 @@ def _imported(id: str) -> Imported:
         package=package,
     )
     env.close()
-    return Imported(task, lambda: Engine(_make(id), seen.encode), limit)
+    return GymnasiumTask(task, lambda: GymnasiumEngine(_make(id), seen.encode), limit)
 
 
 def _make(id: str) -> gymnasium.Env:

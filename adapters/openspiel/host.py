@@ -22,7 +22,7 @@ MEASURED_EVENTS = 5_000  # of random play: seconds where an engine is slow
 LIMIT = 5_000  # events: a state holds them all, and chess allows 17,695
 
 
-class Engine:
+class OpenSpielEngine:
     """A `pyspiel.Game` of two players who take turns, as a host engine; see `suite.interface.host.HostEngine`.
 
     Both players' returns are paid where the game ends, or their signs where the `reward_classes` of `spec` are -1, 0
@@ -94,12 +94,12 @@ def measured(game: Any, spec: EnvironmentSpec) -> EnvironmentSpec:
       NotCategoricalError: an observation holds a number that is no integer in [0, 255].
     """
     anything = dataclasses.replace(spec.observation, high=MAX_SYMBOL)
-    engine = Engine(game, dataclasses.replace(spec, observation=anything, reward_classes=()))
+    engine = OpenSpielEngine(game, dataclasses.replace(spec, observation=anything, reward_classes=()))
     high, returns = 1, {0.0, game.min_utility(), game.max_utility()}
     try:
-        for shown in random_steps(engine, spec.num_actions, MEASURED_EVENTS):
-            high = max(high, int(shown.observation.max()))
-            returns |= set(shown.reward.tolist())
+        for host_step in random_steps(engine, spec.num_actions, MEASURED_EVENTS):
+            high = max(high, int(host_step.observation.max()))
+            returns |= set(host_step.reward.tolist())
     except RunError:
         raise NotCategoricalError from None
     rewards: tuple[float, ...] = SIGNS
@@ -116,4 +116,4 @@ def make(game: Any, spec: EnvironmentSpec) -> HostEnvironment:
       game: a `pyspiel.Game`.
       spec: as `measured` gives it.
     """
-    return HostEnvironment(spec, functools.partial(Engine, game, spec), min(game.max_history_length(), LIMIT))
+    return HostEnvironment(spec, functools.partial(OpenSpielEngine, game, spec), min(game.max_history_length(), LIMIT))

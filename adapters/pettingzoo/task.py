@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 MAX_HIGH = 255
 
 
-class Imported(NamedTuple):
+class PettingZooTask(NamedTuple):
     """An imported game: what it is, and how to make an engine."""
 
     spec: EnvironmentSpec
-    make_engine: Callable[[], Engine]
+    make_engine: Callable[[], PettingZooEngine]
 
 
-class Engine:
+class PettingZooEngine:
     """An AEC environment as a host engine; see `suite.interface.host.HostEngine`."""
 
     def __init__(self, env: pettingzoo.AECEnv):
@@ -104,7 +104,7 @@ def make(id: str, progress: Callable[[str, float], None] | None = None) -> Envir
 
 
 @functools.lru_cache(maxsize=16)
-def _imported(id: str) -> Imported:
+def _imported(id: str) -> PettingZooTask:
     from suite.interface.environment import EnvironmentSpec, ObservationSpec
     from suite.interface.host import random_rewards, reward_classes
 
@@ -128,13 +128,13 @@ def _imported(id: str) -> Imported:
         id=f"pettingzoo/{id}",
         observation=ObservationSpec((sizes[0],), max(int(max(highs)), 1), "symbols"),
         num_actions=int(actions[0].n),
-        reward_classes=reward_classes({-1.0, 1.0} | random_rewards(Engine(env), int(actions[0].n))),
+        reward_classes=reward_classes({-1.0, 1.0} | random_rewards(PettingZooEngine(env), int(actions[0].n))),
         statistics=(("seat", ()),),
         package=distribution(env.unwrapped),
         two_player=True,
     )
     env.close()
-    return Imported(task, lambda: Engine(_make(id)))
+    return PettingZooTask(task, lambda: PettingZooEngine(_make(id)))
 
 
 def _make(id: str) -> pettingzoo.AECEnv:

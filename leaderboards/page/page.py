@@ -122,8 +122,8 @@ def _classes_for_styles(html: str) -> str:
     """Gives each way in which figures draw, some dozens in thousands of places, a class in place of its own words."""
     classes: dict[str, str] = {}
 
-    def named(found: re.Match[str]) -> str:
-        return f' class="{classes.setdefault(found[1], f"f{len(classes)}")}"'
+    def named(match: re.Match[str]) -> str:
+        return f' class="{classes.setdefault(match[1], f"f{len(classes)}")}"'
 
     html = re.sub(r' style="([^"]*)"', named, html)
     rules = "".join(f".{name} {{ {style} }}\n" for style, name in classes.items())
@@ -260,13 +260,13 @@ def _groups(entries: Sequence[Entry]) -> dict[tuple[str, str, str], list[Entry]]
 
 def _stories(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str, Any]]:
     """The figure that comes first, one for each family and preset: do agents learn faster with dreams?"""
-    found: dict[tuple[str, str], dict[str, list[Entry]]] = {}
+    games_of: dict[tuple[str, str], dict[str, list[Entry]]] = {}
     for (task, preset, _), group in _groups(entries).items():
         told = [entry for entry in group if entry.config.agent in plots.STORY]
-        games = found.setdefault((registry.task(task).family, preset), {})
+        games = games_of.setdefault((registry.task(task).family, preset), {})
         if len(told) > 1 and _runs(told) > _runs(games.get(task, [])):
             games[task] = told
-    for (family, preset), games in found.items():
+    for (family, preset), games in games_of.items():
         if games:
             order = [game for game in (*GAMES.get(family, ()), *games) if game in games]
             panels = [_panel(games[game], table, game if len(games) > 1 else "") for game in dict.fromkeys(order)]

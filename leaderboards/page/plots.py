@@ -206,13 +206,13 @@ def _figure(height: float = HEIGHT, rows: int = 1, columns: int = 1) -> Iterator
 
 def _legend(figure: Figure) -> None:
     """Each name once, whichever axes it is in."""
-    found: dict[Any, Any] = {}
+    handles: dict[Any, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
+            handles.setdefault(label, handle)
     figure.legend(
-        handles=list(found.values()),
-        labels=list(found),
+        handles=list(handles.values()),
+        labels=list(handles),
         loc="outside upper left",
         ncols=5,
         handlelength=1.6,
@@ -241,14 +241,14 @@ def _svg(figure: Figure, description: str) -> str:
 def _light(svg: str) -> str:
     """The same picture in a third of the bytes: no names that nothing refers to, coordinates to a tenth of a point."""
     used = set(re.findall(r'(?:href="#|url\(#)([^")]*)', svg))
-    svg = re.sub(r' id="([^"]*)"', lambda found: found[0] if found[1] in used else "", svg)
+    svg = re.sub(r' id="([^"]*)"', lambda match: match[0] if match[1] in used else "", svg)
     svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
     svg = re.sub(r" font-family: [^;\"]*;", "", svg)  # the page's own
     svg = re.sub(r' transform="rotate\(-0 [^"]*"', "", svg)
 
-    def rounded(found: re.Match[str]) -> str:
-        numbers = re.sub(r"-?[0-9]+\.[0-9]+", lambda number: f"{float(number[0]):.1f}".removesuffix(".0"), found[2])
-        return f'{found[1]}"{" ".join(numbers.replace("L", "").split())}"'  # lines follow a first point by themselves
+    def rounded(match: re.Match[str]) -> str:
+        numbers = re.sub(r"-?[0-9]+\.[0-9]+", lambda number: f"{float(number[0]):.1f}".removesuffix(".0"), match[2])
+        return f'{match[1]}"{" ".join(numbers.replace("L", "").split())}"'  # lines follow a first point by themselves
 
     svg = re.sub(r'( (?:d|x|y|x1|x2|y1|y2|width|height|transform|points)=)"([^"]*)"', rounded, svg)
     return re.sub(r">\s+<", "><", svg)

@@ -62,31 +62,31 @@ def iterate(
     config = agent.config
     imagined_updates = imagined_updates or config.imagined_updates
     collect_key, tokenizer_key, model_key, dream_key = jax.random.split(key, 4)
-    learner, player, replay = state.learner, state.player, state.replay
+    policy_state, rollout_state, replay = state.policy, state.rollout, state.replay
     tokenizer, world_model = state.tokenizer, state.world_model
     del state
 
     # Step 1: N_env environments play T_env real steps, which enter the replay buffer.
-    player, trajectory, log = call("collect", agent.collect, learner.acting, player, collect_key)
+    rollout_state, trajectory, log = call("collect", agent.collect, policy_state.acting, rollout_state, collect_key)
     before, steps = steps, steps + int(np.asarray(log.counts_TB).sum())
     if replay is not None:
         replay = call("remember", agent.remember, replay, trajectory)
 
     # Step 2: the policy learns from them.
     if config.ppo.learn_from_real and config.policy.kind != "uniform":
-        learner, _ = call("learn", agent.learn, learner, trajectory, jnp.array([before, steps], jnp.float32))
+        policy_state, _ = call("learn", agent.learn, policy_state, trajectory, jnp.array([before, steps], jnp.float32))
     del trajectory, log  # their memory is the world model's now
 
     # Step 3: tokenizer and world model learn from replayed steps.
     known = None
     if world_model is not None:
         tokenizer, _ = call("tokenizer", agent.update_tokenizer, tokenizer, replay, tokenizer_key)
-        world_model, found = call("world_model", agent.update_world_model, world_model, tokenizer, replay, model_key)
-        known = float(found["reward_known"]) if "reward_known" in found else None
+        world_model, metrics = call("world_model", agent.update_world_model, world_model, tokenizer, replay, model_key)
+        known = float(metrics["reward_known"]) if "reward_known" in metrics else None
 
     # Step 4: the policy learns from dreams, which begin at replayed frames.
     if updates := imagined_updates(steps, known):
         dreamt = None if world_model is None else world_model.dreaming
         count = jnp.asarray(updates, jnp.int32)
-        learner, _ = call("imagine", agent.imagine, learner, dreamt, tokenizer, replay, dream_key, count)
-    return TrainState(learner, player, replay, tokenizer, world_model), steps
+        policy_state, _ = call("imagine", agent.imagine, policy_state, dreamt, tokenizer, replay, dream_key, count)
+    return TrainState(policy_state, rollout_state, replay, tokenizer, world_model), steps

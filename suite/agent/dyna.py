@@ -100,31 +100,31 @@ class Agent:
     def _new_world_model(self, rngs: nnx.Rngs) -> WorldModel:
         return WorldModel(self.config.world_model, self.tokens, self.grid, rngs)
 
-    def _policy(self, learner: ppo.Learner) -> Any:
-        return nnx.merge(self.policy_graph, learner.params)
+    def _policy(self, policy_state: ppo.PolicyTrainState) -> Any:
+        return nnx.merge(self.policy_graph, policy_state.params)
 
     def init(self, key: jax.Array) -> TrainState:
         """A fresh agent in fresh environments: two programs, since `start` is worth compiling only once."""
-        policy_key, player_key, tokenizer_key, model_key = jax.random.split(key, 4)
+        policy_key, rollout_key, tokenizer_key, model_key = jax.random.split(key, 4)
         untrained = self._untrained(policy_key, tokenizer_key, model_key)
-        return TrainState(player=self.start(untrained["learner"].acting, player_key), **untrained)
+        return TrainState(rollout=self.start(untrained["policy"].acting, rollout_key), **untrained)
 
     @functools.partial(jax.jit, static_argnums=0)
     def _untrained(self, policy_key: jax.Array, tokenizer_key: jax.Array, model_key: jax.Array) -> dict[str, Any]:
-        """What a fresh `TrainState` holds besides its player."""
+        """What a fresh `TrainState` holds besides its rollout."""
         params = nnx.state(self._new_policy(nnx.Rngs(policy_key)))
-        fresh = {"learner": ppo.Learner.create(self.config.ppo, self.policy_optimizer, params)}
+        fresh = {"policy": ppo.PolicyTrainState.create(self.config.ppo, self.policy_optimizer, params)}
         if self.config.dreams:
             fresh["replay"] = self.new_replay()
         if not self.config.world_model.enabled:
             return fresh
         model_params = nnx.state(self._new_world_model(nnx.Rngs(model_key)))
-        learner = world_model_training.WorldModelLearner.create(
+        model_state = world_model_training.WorldModelTrainState.create(
             self.config.world_model, self.world_model_optimizer, model_params
         )
         if self.config.imagination.trust_window:
-            learner = dataclasses.replace(learner, measured=jnp.zeros(1 + len(self.tokens.reward_classes)))
-        return fresh | {"tokenizer": self.tokenizer.init(tokenizer_key), "world_model": learner}
+            model_state = dataclasses.replace(model_state, measured=jnp.zeros(1 + len(self.tokens.reward_classes)))
+        return fresh | {"tokenizer": self.tokenizer.init(tokenizer_key), "world_model": model_state}
 
     def new_replay(self) -> ReplayState:
         """An empty replay buffer, with room for the environments' states if dreams happen in the game."""
@@ -139,19 +139,19 @@ class Agent:
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state_B)
 
     @functools.partial(jax.jit, static_argnums=0)
-    def start(self, learner: ppo.Learner, key: jax.Array) -> play.Player:
-        """A player in fresh environments; it remembers nothing."""
-        return play.start(self._policy(learner), self.batched, key, self.config.environment.burn_in)
+    def start(self, policy_state: ppo.PolicyTrainState, key: jax.Array) -> play.RolloutState:
+        """The start of a rollout in fresh environments; the policy remembers nothing."""
+        return play.start(self._policy(policy_state), self.batched, key, self.config.environment.burn_in)
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=2)
     def collect(
-        self, learner: ppo.Learner, player: play.Player, key: jax.Array
-    ) -> tuple[play.Player, ppo.Trajectory, play.EpisodeLog]:
+        self, policy_state: ppo.PolicyTrainState, rollout_state: play.RolloutState, key: jax.Array
+    ) -> tuple[play.RolloutState, ppo.Trajectory, play.EpisodeLog]:
         """Step 1: T_env real steps in each of N_env environments."""
-        config, policy = self.config.environment, self._policy(learner)
-        player = play.refresh(policy, player, carried=config.burn_in_start == "carried")
+        config, policy = self.config.environment, self._policy(policy_state)
+        rollout_state = play.refresh(policy, rollout_state, carried=config.burn_in_start == "carried")
         keep = self.config.imagination.world == "game"
-        return play.rollout(key, policy, learner.targets, self.batched, player, config.rollout_length, keep)
+        return play.rollout(key, policy, policy_state.targets, self.batched, rollout_state, config.rollout_length, keep)
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def remember(self, replay: ReplayState, trajectory: ppo.Trajectory) -> ReplayState:
@@ -159,7 +159,9 @@ class Agent:
         return self.replay.add(replay, trajectory)
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
-    def learn(self, learner: ppo.Learner, trajectory: ppo.Trajectory, steps: jax.Array) -> tuple[ppo.Learner, Metrics]:
+    def learn(
+        self, policy_state: ppo.PolicyTrainState, trajectory: ppo.Trajectory, steps: jax.Array
+    ) -> tuple[ppo.PolicyTrainState, Metrics]:
         """Step 2: PPO on the real steps. `steps`: float32 [2], taken before and after them."""
         config = self.config.ppo
         left = jnp.maximum(1 - steps / self.config.total_steps, 0.0)
@@ -167,7 +169,7 @@ class Agent:
             config,
             self.policy_optimizer,
             self.policy_graph,
-            learner,
+            policy_state,
             trajectory,
             epochs=config.epochs,
             minibatches=config.minibatches,
@@ -194,46 +196,46 @@ class Agent:
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def update_world_model(
         self,
-        learner: world_model_training.WorldModelLearner,
+        model_state: world_model_training.WorldModelTrainState,
         tokenizer: TokenizerState,
         replay: ReplayState,
         key: jax.Array,
-    ) -> tuple[world_model_training.WorldModelLearner, Metrics]:
+    ) -> tuple[world_model_training.WorldModelTrainState, Metrics]:
         """Step 3, second half (Algorithm 5): the transformer learns from replayed sequences of T_WM + 1 frames."""
         config, plan = self.config.world_model, self.config.imagination
         if config.patch_contents and self.tokens.content_size:
-            learner = learner.shown(self.tokenizer.contents(tokenizer))
-        if learner.measured is not None:
-            new = self._measure(learner.dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
-            measured = learner.measured + (new - learner.measured) / plan.trust_window
-            learner = dataclasses.replace(learner, measured=measured)
+            model_state = model_state.with_contents(self.tokenizer.contents(tokenizer))
+        if model_state.measured is not None:
+            new = self._measure(model_state.dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
+            measured = model_state.measured + (new - model_state.measured) / plan.trust_window
+            model_state = dataclasses.replace(model_state, measured=measured)
 
-        def update(learner, key):
+        def update(model_state, key):
             sample_key, dropout_key = jax.random.split(key)
             sequences = self._replayed(tokenizer, replay, sample_key)
-            learner, metrics = world_model_training.update(
+            model_state, metrics = world_model_training.update(
                 config,
                 self.world_model_optimizer,
                 self.world_model_graph,
                 self.tokens,
-                learner,
+                model_state,
                 sequences,
                 dropout_key,
             )
-            return learner, (metrics, sequences.reward_BT if plan.trust else None)
+            return model_state, (metrics, sequences.reward_BT if plan.trust else None)
 
         keys = jax.random.split(key, config.updates * config.minibatches)
-        learner, (metrics, reward_NBT) = jax.lax.scan(update, learner, keys)
+        model_state, (metrics, reward_NBT) = jax.lax.scan(update, model_state, keys)
         metrics = jax.tree.map(jnp.mean, metrics)
         if plan.trust:
             loss = metrics["reward_loss"]
             frequency_R = world_model_training.reward_frequency(self.tokens, reward_NBT)
-            if learner.measured is not None:
+            if model_state.measured is not None:
                 # Averages that began with zeros are all too small by the same factor, which is what frequencies lack.
-                loss, frequency_R = learner.measured[0], learner.measured[1:]
+                loss, frequency_R = model_state.measured[0], model_state.measured[1:]
                 loss, frequency_R = loss / frequency_R.sum(), frequency_R / frequency_R.sum()
             metrics["reward_known"] = world_model_training.known_share(loss, frequency_R)
-        return learner, metrics
+        return model_state, metrics
 
     def _replayed(
         self, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array, recent: int = 0
@@ -277,13 +279,13 @@ class Agent:
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def imagine(
         self,
-        learner: ppo.Learner,
+        policy_state: ppo.PolicyTrainState,
         world_model: nnx.State | None,
         tokenizer: TokenizerState | None,
         replay: ReplayState,
         key: jax.Array,
         updates: jax.Array,
-    ) -> tuple[ppo.Learner, Metrics]:
+    ) -> tuple[ppo.PolicyTrainState, Metrics]:
         """Step 4: `updates` times (a traced number, so that annealing never recompiles), dream and learn from it.
 
         An agent that dreams in the true game has neither `world_model` nor `tokenizer`.
@@ -291,47 +293,47 @@ class Agent:
         model = None if world_model is None else nnx.merge(self.world_model_graph, world_model)
 
         def update(i, carry):
-            learner, total = carry
-            trajectory = self.dream(learner, model, tokenizer, replay, jax.random.fold_in(key, i))
-            learner, metrics = self.learn_from_dream(learner, trajectory)
+            policy_state, total = carry
+            trajectory = self.dream(policy_state, model, tokenizer, replay, jax.random.fold_in(key, i))
+            policy_state, metrics = self.learn_from_dream(policy_state, trajectory)
             metrics |= {
                 "reward_per_step": trajectory.reward_TB.mean(),
                 "termination_rate": trajectory.terminated_TB.mean(dtype=jnp.float32),
             }
-            return learner, jax.tree.map(jnp.add, total, metrics)
+            return policy_state, jax.tree.map(jnp.add, total, metrics)
 
         zeros = dict.fromkeys(IMAGINATION_METRICS, jnp.zeros(()))
-        learner, total = jax.lax.fori_loop(0, updates, update, (learner, zeros))
-        return learner, jax.tree.map(lambda x: x / updates.astype(jnp.float32), total)
+        policy_state, total = jax.lax.fori_loop(0, updates, update, (policy_state, zeros))
+        return policy_state, jax.tree.map(lambda x: x / updates.astype(jnp.float32), total)
 
     def dream(
         self,
-        learner: ppo.Learner,
+        policy_state: ppo.PolicyTrainState,
         model: WorldModel | None,
         tokenizer: TokenizerState | None,
         replay: ReplayState,
         key: jax.Array,
     ) -> ppo.Trajectory:
         """One imagined rollout from replayed frames, the memory refreshed on the M frames before each (note 12)."""
-        plan, policy, memory = self.config.imagination, self._policy(learner), self.config.environment.burn_in
+        plan, policy, memory = self.config.imagination, self._policy(policy_state), self.config.environment.burn_in
         sample_key, start_key, rollout_key = jax.random.split(key, 3)
         before = max(memory, self.past)
         past = self.replay.sample(replay, sample_key, plan.num_envs, before + 1, plan.recent)
         past = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), past)
         dream = self._dreamt_world(model, tokenizer, past)
-        player = play.start(policy, dream, start_key, 0)
-        player = dataclasses.replace(
-            player,
-            time_step=dataclasses.replace(player.time_step, first=past.first[-1]),
+        rollout_state = play.start(policy, dream, start_key, 0)
+        rollout_state = dataclasses.replace(
+            rollout_state,
+            time_step=dataclasses.replace(rollout_state.time_step, first=past.first[-1]),
             recent=play.Recent(
                 past.observation[before - memory : -1],
                 past.first[before - memory : -1],
-                player.hidden_BH,
+                rollout_state.hidden_BH,
                 None if past.turn is None else past.turn.ours[before - memory : -1],
             ),
         )
-        player = play.refresh(policy, player, carried=False)
-        _, trajectory, _ = play.rollout(rollout_key, policy, learner.targets, dream, player, plan.horizon)
+        rollout_state = play.refresh(policy, rollout_state, carried=False)
+        _, trajectory, _ = play.rollout(rollout_key, policy, policy_state.targets, dream, rollout_state, plan.horizon)
         return trajectory
 
     def _dreamt_world(
@@ -380,14 +382,16 @@ class Agent:
             min_p=plan.min_p,
         )
 
-    def learn_from_dream(self, learner: ppo.Learner, trajectory: ppo.Trajectory) -> tuple[ppo.Learner, Metrics]:
+    def learn_from_dream(
+        self, policy_state: ppo.PolicyTrainState, trajectory: ppo.Trajectory
+    ) -> tuple[ppo.PolicyTrainState, Metrics]:
         """PPO on one imagined trajectory."""
         plan = self.config.imagination
         return ppo.update(
             self.config.ppo,
             self.policy_optimizer,
             self.policy_graph,
-            learner,
+            policy_state,
             trajectory,
             epochs=plan.epochs,
             minibatches=plan.minibatches,

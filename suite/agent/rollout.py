@@ -33,7 +33,7 @@ class Recent:
 
 
 @struct.dataclass
-class Player:
+class RolloutState:
     """Everything that a rollout carries on to the next one.
 
     Attributes:
@@ -67,8 +67,8 @@ class EpisodeLog:
     statistics_TB: dict[str, jax.Array]
 
 
-def start(policy: Any, environment: BatchedEnvironment, key: jax.Array, burn_in: int) -> Player:
-    """A player at the first frame of B fresh episodes, remembering nothing.
+def start(policy: Any, environment: BatchedEnvironment, key: jax.Array, burn_in: int) -> RolloutState:
+    """The state of a rollout at the first frame of B fresh episodes; the policy remembers nothing.
 
     The `burn_in` recent frames do not exist yet: their zeros never count, because `first` clears the memory.
     """
@@ -81,7 +81,7 @@ def start(policy: Any, environment: BatchedEnvironment, key: jax.Array, burn_in:
         hidden_BH=hidden_BH,
         acting_MB=None if time_step.turn is None else jnp.zeros((burn_in, batch), bool),
     )
-    return Player(
+    return RolloutState(
         state=state,
         time_step=time_step,
         hidden_BH=hidden_BH,
@@ -91,20 +91,20 @@ def start(policy: Any, environment: BatchedEnvironment, key: jax.Array, burn_in:
     )
 
 
-def refresh(policy: Any, player: Player, *, carried: bool) -> Player:
+def refresh(policy: Any, rollout_state: RolloutState, *, carried: bool) -> RolloutState:
     """Burn-in: recomputes the memory over the recent events with today's parameters (Algorithm 4, note 12).
 
     Args:
       policy: the actor-critic.
-      player: whose memory to refresh.
+      rollout_state: whose memory to refresh.
       carried: start from the memory that preceded those events, rather than from zero.
     """
-    recent = player.recent
+    recent = rollout_state.recent
     if recent.first_MB.shape[0] == 0:
-        return player
+        return rollout_state
     hidden_BH = recent.hidden_BH if carried else jnp.zeros_like(recent.hidden_BH)
     hidden_BH = policy.advance(recent.observation_MB, recent.first_MB, hidden_BH, recent.acting_MB)
-    return dataclasses.replace(player, hidden_BH=hidden_BH)
+    return dataclasses.replace(rollout_state, hidden_BH=hidden_BH)
 
 
 def rollout(
@@ -112,10 +112,10 @@ def rollout(
     policy: Any,
     targets: TargetStatistics,
     environment: BatchedEnvironment,
-    player: Player,
+    rollout_state: RolloutState,
     length: int,
     keep_states: bool = False,
-) -> tuple[Player, Trajectory, EpisodeLog]:
+) -> tuple[RolloutState, Trajectory, EpisodeLog]:
     """`length` events in each of B environments.
 
     Args:
@@ -123,12 +123,12 @@ def rollout(
       policy: the actor-critic; its values are standardized, `targets` brings them back to reward units.
       targets: value statistics.
       environment: the real environments or a dream.
-      player: where to go on from; its memory already refreshed.
+      rollout_state: where to go on from; its memory already refreshed.
       length: T.
       keep_states: put the environments' own states into the trajectory, beside each frame.
 
     Returns:
-      the player after the last event, the trajectory [T, B] for PPO, and the episodes' totals.
+      the state after the last event, the trajectory [T, B] for PPO, and the episodes' totals.
     """
 
     def value_after(observation_B, hidden_BH):
@@ -137,16 +137,16 @@ def rollout(
         output, _ = policy(observation_B[None], not_first_1B, hidden_BH)
         return targets.denormalize(output.value_TB[0])
 
-    def event(player: Player, key: jax.Array):
+    def event(rollout_state: RolloutState, key: jax.Array):
         act_key, turn_key, step_key = jax.random.split(key, 3)
-        now, turn = player.time_step, player.time_step.turn
+        now, turn = rollout_state.time_step, rollout_state.time_step.turn
         acting_1B = None if turn is None else turn.ours[None]
-        output, hidden_BH = policy(now.observation[None], now.first[None], player.hidden_BH, acting_1B)
+        output, hidden_BH = policy(now.observation[None], now.first[None], rollout_state.hidden_BH, acting_1B)
         logits_BA = mask_logits(output.logits_TBA[0], None if turn is None else turn.legal_A)
         action_B = jax.random.categorical(act_key, logits_BA).astype(jnp.int32)
         log_probability_B = jnp.take_along_axis(jax.nn.log_softmax(logits_BA), action_B[:, None], axis=1)[:, 0]
         event_B = action_B if turn is None else choose_event(turn_key, turn, action_B)
-        state, after = environment.step(step_key, player.state, event_B)
+        state, after = environment.step(step_key, rollout_state.state, event_B)
         # A time limit is not an end: the frame it cut off at still has a value. Rare, hence the conditional.
         truncation_value_B = jax.lax.cond(
             after.truncated.any(),
@@ -154,7 +154,7 @@ def rollout(
             lambda: jnp.zeros_like(after.reward),
         )
         ended_B = after.terminated | after.truncated
-        return_B, length_B = player.return_B + after.reward, player.length_B + 1
+        return_B, length_B = rollout_state.return_B + after.reward, rollout_state.length_B + 1
         step = Trajectory(
             observation_TB=now.observation,
             action_TB=event_B,
@@ -164,33 +164,35 @@ def rollout(
             first_TB=now.first,
             log_probability_TB=log_probability_B,
             value_TB=targets.denormalize(output.value_TB[0]),
-            hidden_BH=player.hidden_BH,
+            hidden_BH=rollout_state.hidden_BH,
             last_value_B=jnp.zeros_like(after.reward),
             truncation_value_TB=truncation_value_B,
             turn_TB=turn,
-            state_TB=player.state if keep_states else None,
+            state_TB=rollout_state.state if keep_states else None,
         )
         counts_B = jnp.ones_like(ended_B) if turn is None else turn.player != CHANCE
         log = EpisodeLog(counts_B, ended_B, return_B, length_B, after.statistics)
-        player = dataclasses.replace(
-            player,
+        rollout_state = dataclasses.replace(
+            rollout_state,
             state=state,
             time_step=after,
             hidden_BH=hidden_BH,
             return_B=jnp.where(ended_B, 0.0, return_B),
             length_B=jnp.where(ended_B, 0, length_B),
         )
-        return player, (step, log)
+        return rollout_state, (step, log)
 
-    start_recent = player.recent
-    player, (steps, log) = jax.lax.scan(event, player, jax.random.split(key, length))
+    start_recent = rollout_state.recent
+    rollout_state, (steps, log) = jax.lax.scan(event, rollout_state, jax.random.split(key, length))
     memory_TBH = steps.hidden_BH  # before each step; PPO needs the first, burn-in the one M steps ago
-    last, _ = policy(player.time_step.observation[None], player.time_step.first[None], player.hidden_BH)
+    last, _ = policy(
+        rollout_state.time_step.observation[None], rollout_state.time_step.first[None], rollout_state.hidden_BH
+    )
     trajectory = dataclasses.replace(
         steps,
         hidden_BH=memory_TBH[0],
         last_value_B=targets.denormalize(last.value_TB[0]),
-        last_ours_B=None if player.time_step.turn is None else player.time_step.turn.ours,
+        last_ours_B=None if rollout_state.time_step.turn is None else rollout_state.time_step.turn.ours,
     )
     if burn_in := start_recent.first_MB.shape[0]:
         since = length - burn_in  # not negative: suite.configuration.schema sees to it
@@ -200,5 +202,5 @@ def rollout(
             hidden_BH=memory_TBH[since],
             acting_MB=None if trajectory.turn_TB is None else trajectory.turn_TB.ours[since:],
         )
-        player = dataclasses.replace(player, recent=recent)
-    return player, trajectory, log
+        rollout_state = dataclasses.replace(rollout_state, recent=recent)
+    return rollout_state, trajectory, log

@@ -5,10 +5,10 @@ from __future__ import annotations
 from flax import struct
 
 from suite.agent.replay import ReplayState
-from suite.agent.rollout import Player
+from suite.agent.rollout import RolloutState
 from suite.interface.tokens import TokenizerState
-from suite.policy.ppo import Learner
-from suite.world_model.training import WorldModelLearner
+from suite.policy.ppo import PolicyTrainState
+from suite.world_model.training import WorldModelTrainState
 
 
 @struct.dataclass
@@ -16,13 +16,13 @@ class TrainState:
     """Everything that a run carries from one iteration to the next.
 
     Attributes:
-      learner: policy parameters, their optimizer, value statistics.
-      player: the real environments and the policy's memory of them.
+      policy: policy parameters, their optimizer, value statistics.
+      rollout: the real environments and the policy's memory of them.
       replay, tokenizer, world_model: None for model-free agents.
     """
 
-    learner: Learner
-    player: Player
+    policy: PolicyTrainState
+    rollout: RolloutState
     replay: ReplayState | None = None
     tokenizer: TokenizerState | None = None
-    world_model: WorldModelLearner | None = None
+    world_model: WorldModelTrainState | None = None

@@ -1,1 +1,1 @@
-"""What `suite bench` measures: each phase's time and rate, and races between two ways of doing the same."""
+"""What `suite bench` measures: each phase's time and rate, and comparisons between two ways of doing the same."""

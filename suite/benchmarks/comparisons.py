@@ -29,9 +29,9 @@ from suite.runtime.compilation import enable_compilation_cache
 from suite.world_model.imagination import next_frame
 from suite.world_model.transformer import WorldModel
 
-Table = list[dict[str, Any]]
-RACE_ENVS, RACE_STEPS = 48, 96
-RACE_FRAMES = 20  # the paper's T_WM, whatever the preset's: the longer the context, the more a cache saves
+Rows = list[dict[str, Any]]
+NUM_ENVS, NUM_STEPS = 48, 96
+NUM_FRAMES = 20  # the paper's T_WM, whatever the preset's: the longer the context, the more a cache saves
 
 
 def seconds_of(function: Callable[[], Any], least: float = 1.0, repeats: int = 3) -> float:
@@ -44,22 +44,22 @@ def seconds_of(function: Callable[[], Any], least: float = 1.0, repeats: int = 3
     return sorted(times)[len(times) // 2]
 
 
-def reset_race(config: Config, environment: Environment) -> Table:
+def compare_resets(config: Config, environment: Environment) -> Rows:
     """Random play with exact auto-reset, against no reset at all (where that can be) and the package's own."""
-    contestants: dict[str, BatchedEnvironment] = {"exact auto-reset": Batched(environment, RACE_ENVS)}
+    variants: dict[str, BatchedEnvironment] = {"exact auto-reset": Batched(environment, NUM_ENVS)}
     if not isinstance(environment, HostEnvironment):  # whose engines take no step after an end
-        contestants["no reset"] = NoReset(environment, RACE_ENVS)
+        variants["no reset"] = NoReset(environment, NUM_ENVS)
     own = registry.task(config.task).own_auto_reset
     if own is not None:
-        contestants["the package's own auto-reset"] = own()(RACE_ENVS)
-    played = {name: _player_of(contestant, environment.spec.num_actions) for name, contestant in contestants.items()}
+        variants["the package's own auto-reset"] = own()(NUM_ENVS)
+    played = {name: _player_of(contestant, environment.spec.num_actions) for name, contestant in variants.items()}
     times: dict[str, list[float]] = {name: [] for name in played}
     for _ in range(7):  # in turn, so that a drifting machine slows all of them
         for name, play in played.items():
             start = time.perf_counter()
             play()
             times[name].append(time.perf_counter() - start)
-    speed = {name: RACE_ENVS * RACE_STEPS / sorted(values)[len(values) // 2] for name, values in times.items()}
+    speed = {name: NUM_ENVS * NUM_STEPS / sorted(values)[len(values) // 2] for name, values in times.items()}
     bound = speed.get("no reset", float("nan"))
     return [{"environment": n, "steps/s": s, "of no reset": s / bound} for n, s in speed.items()]
 
@@ -83,7 +83,7 @@ class NoReset:
 
 
 def _player_of(environment: BatchedEnvironment, num_actions: int) -> Callable[[], None]:
-    """A compiled and warmed-up call that plays `RACE_STEPS` random steps and goes on from there the next time."""
+    """A compiled and warmed-up call that plays `NUM_STEPS` random steps and goes on from there the next time."""
 
     def act(key, turn):
         if turn is None:
@@ -100,7 +100,7 @@ def _player_of(environment: BatchedEnvironment, num_actions: int) -> Callable[[]
 
     @jax.jit
     def play(carry, key):
-        return jax.lax.scan(step, carry, jax.random.split(key, RACE_STEPS))
+        return jax.lax.scan(step, carry, jax.random.split(key, NUM_STEPS))
 
     state, time_step = jax.jit(environment.reset)(jax.random.key(0))
     holder: list[Any] = [(state, time_step.turn), jax.random.key(1)]
@@ -114,10 +114,10 @@ def _player_of(environment: BatchedEnvironment, num_actions: int) -> Callable[[]
     return go_on
 
 
-def cache_race(agent: Agent) -> Table:
+def compare_caches(agent: Agent) -> Rows:
     """The last imagined step of a context of 20 frames, with the key-value cache and by recomputing all frames."""
     config, tokens = agent.config, agent.tokens
-    batch, length = config.imagination.num_envs, RACE_FRAMES
+    batch, length = config.imagination.num_envs, NUM_FRAMES
     model = WorldModel(config.world_model, tokens, agent.grid, nnx.Rngs(0))
     graph, params = nnx.split(model)
     frames = _random_tokens(tokens, (batch, length))
@@ -143,10 +143,10 @@ def cache_race(agent: Agent) -> Table:
     ]
 
 
-def sampler_race(agent: Agent) -> Table:
+def compare_samplers(agent: Agent) -> Rows:
     """The frame after 20 frames, imagined as a block and token by token, both with the key-value cache (Section 3.6).
 
-    Models of the same size, fresh. No race where tokens are vectors: those cannot be imagined one by one.
+    Models of the same size, fresh. No comparison where tokens are vectors: those cannot be imagined one by one.
     """
     tokens, batch = agent.tokens, agent.config.imagination.num_envs
     if tokens.token_size:
@@ -159,8 +159,8 @@ def sampler_race(agent: Agent) -> Table:
         config = dataclasses.replace(agent.config.world_model, block_teacher_forcing=blocks)
         model = WorldModel(config, tokens, agent.grid, nnx.Rngs(0))
         graph, params = nnx.split(model)
-        cache = model.init_cache(batch, RACE_FRAMES)
-        cache = dataclasses.replace(cache, index=jnp.int32((RACE_FRAMES - 1) * model.block))
+        cache = model.init_cache(batch, NUM_FRAMES)
+        cache = dataclasses.replace(cache, index=jnp.int32((NUM_FRAMES - 1) * model.block))
 
         @jax.jit
         def imagine(params, cache, graph=graph):
@@ -179,12 +179,12 @@ def _random_tokens(tokens: TokenSpec, lead: tuple[int, ...]) -> jax.Array:
     return jax.random.randint(jax.random.key(1), shape, 0, tokens.num_codes)
 
 
-def start_up_race(config: Config) -> Table:
+def compare_starts(config: Config) -> Rows:
     """Starts the same command in two new processes that share a cache folder, empty before the first.
 
     The seconds are a whole process's: from its start until it has computed its first policy update.
     """
-    rows: Table = []
+    rows: Rows = []
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "SUITE_CACHE_DIR": f"{folder}/cache"}
         for name in ("first start", "second start"):
@@ -198,14 +198,14 @@ def start_up_race(config: Config) -> Table:
 
 
 def _first_training_step(config: Config) -> None:
-    """What `start_up_race` runs: the start of `suite.runs.training`, up to the first policy update."""
+    """What `compare_starts` runs: the start of `suite.runs.training`, up to the first policy update."""
     enable_compilation_cache()
     agent = Agent(config, registry.task(config.task).make()(None))
     state = agent.init(jax.random.key(0))
-    player, trajectory, _ = agent.collect(state.learner.acting, state.player, jax.random.key(1))
+    rollout_state, trajectory, _ = agent.collect(state.policy.acting, state.rollout, jax.random.key(1))
     if config.ppo.learn_from_real:
-        jax.block_until_ready(agent.learn(state.learner, trajectory, jnp.zeros(2, jnp.float32)))
-    jax.block_until_ready(player)
+        jax.block_until_ready(agent.learn(state.policy, trajectory, jnp.zeros(2, jnp.float32)))
+    jax.block_until_ready(rollout_state)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,14 @@ import jax.numpy as jnp
 from suite import registry
 from suite.agent.algorithm import iterate, iteration_key, start_key
 from suite.agent.dyna import Agent
-from suite.benchmarks.comparisons import Table, cache_race, reset_race, sampler_race, seconds_of, start_up_race
+from suite.benchmarks.comparisons import (
+    Rows,
+    compare_caches,
+    compare_resets,
+    compare_samplers,
+    compare_starts,
+    seconds_of,
+)
 from suite.benchmarks.flops import count_flops
 from suite.configuration.schema import Config
 from suite.records.record import peak_memory
@@ -50,15 +57,15 @@ def bench(config: Config, reporter: Reporter, start_up: bool = True) -> dict[str
     report["phases of one iteration"] = phases
     report |= _summary(config, agent, phases)
     reporter.message("racing the environment's resets")
-    report["environment steps/s, random actions"] = reset_race(config, environment)
+    report["environment steps/s, random actions"] = compare_resets(config, environment)
     if config.world_model.enabled:
         reporter.message("racing the key-value cache")
-        report["one imagined step"] = cache_race(agent)
-        if race := sampler_race(agent):
-            report["one imagined frame"] = race
+        report["one imagined step"] = compare_caches(agent)
+        if samplers := compare_samplers(agent):
+            report["one imagined frame"] = samplers
     if start_up:
         reporter.message("starting the same command twice")
-        report["seconds to the first training step"] = start_up_race(config)
+        report["seconds to the first training step"] = compare_starts(config)
     report["peak memory (MiB)"] = {name: bytes_ / 2**20 for name, bytes_ in peak_memory().items()}
     return report
 
@@ -72,12 +79,12 @@ def matmul_rate(compute_type: str) -> float:
     return 2 * size**3 / seconds_of(lambda: product(a, b))
 
 
-def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: Reporter) -> Table:
+def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: Reporter) -> Rows:
     """One row per phase of an iteration after warmup: time, share, and what it achieves.
 
     `agent` has few model updates, and one imagined one is measured; their time is scaled to `config`'s.
     """
-    rows: Table = []
+    rows: Rows = []
     scales = {
         "tokenizer": config.tokenizer.updates / max(1, agent.config.tokenizer.updates),
         "world_model": config.world_model.updates / max(1, agent.config.world_model.updates),
@@ -117,7 +124,7 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
     return rows
 
 
-def _summary(config: Config, agent: Agent, phases: Table) -> dict[str, Any]:
+def _summary(config: Config, agent: Agent, phases: Rows) -> dict[str, Any]:
     """Rates of the phases, and from them the wall-clock of the whole run."""
     ms = {row["phase"]: row["ms"] for row in phases}
     steps = config.steps_per_iteration

@@ -26,13 +26,13 @@ def execute(args: argparse.Namespace) -> int:
     from leaderboards.results import finished_in
 
     comparisons = compare(finished_in(args.folders), args.parts, args.score)
-    for found in comparisons:
-        print(f"{found.task}, preset {found.preset}, {found.steps:,} steps\n")
-        for table in tables(found):
+    for comparison in comparisons:
+        print(f"{comparison.task}, preset {comparison.preset}, {comparison.steps:,} steps\n")
+        for table in tables(comparison):
             head = list(map(str, table.columns))
             for row in (head, ["---"] * len(head), *table.to_numpy().tolist()):
                 print(f"| {' | '.join(row)} |")
             print()
     if args.json:
-        print_json([dataclasses.asdict(found) for found in comparisons])
+        print_json([dataclasses.asdict(comparison) for comparison in comparisons])
     return 0

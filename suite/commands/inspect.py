@@ -31,15 +31,15 @@ def _inspect_games(args: argparse.Namespace) -> int:
     from suite.diagnostics.rules import rules_of_run
 
     reporter = make_reporter(args.quiet)
-    found = {str(folder): rules_of_run(folder, args.games, reporter) for folder in args.folders}
+    kept = {str(folder): rules_of_run(folder, args.games, reporter) for folder in args.folders}
     reporter.stop()
-    for name, plays in found.items():
+    for name, plays in kept.items():
         print(name)
         columns = [[format_value(kept[row]) for row in kept] for kept in plays.values()]
         rows = [row.replace("_percent", " %").replace("_", " ") for row in next(iter(plays.values()))]
         print_table([["played by", *plays], *zip(rows, *columns, strict=True)])
     if args.json:
-        print_json(found)
+        print_json(kept)
     return 0
 
 
@@ -47,16 +47,16 @@ def _inspect_rollouts(args: argparse.Namespace) -> int:
     from suite.diagnostics.inspection import inspect
 
     reporter = make_reporter(args.quiet)
-    found = inspect(args.folders, args.out, reporter)
+    result = inspect(args.folders, args.out, reporter)
     reporter.stop()
-    runs = found["runs"]
+    runs = result["runs"]
     names = list(dict.fromkeys(name for row in runs.values() for name in row))
     rows = [
         [name.replace("_percent", " %").replace("_", " "), *(format_value(row.get(name, "")) for row in runs.values())]
         for name in names
     ]
     print_table([["mean over rollout steps", *runs], *rows])
-    print(f"tables, curves and filmstrips in {found['folder']}")
+    print(f"tables, curves and filmstrips in {result['folder']}")
     if args.json:
-        print_json(found)
+        print_json(result)
     return 0

@@ -41,8 +41,8 @@ def score_line(name: str, value: float, error: float | None = None) -> str:
     label, unit = name.replace("_percent", "").replace("_", " "), " %" if "_percent" in name else ""
     if math.isnan(value):
         return f"{label} n/a"
-    spread = "" if error is None else f" +- {format_value(error)}{unit}"
-    return f"{label} {format_value(value)}{unit}{spread}"
+    deviation = "" if error is None else f" +- {format_value(error)}{unit}"
+    return f"{label} {format_value(value)}{unit}{deviation}"
 
 
 def format_value(value: Any) -> str:

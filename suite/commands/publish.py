@@ -26,25 +26,27 @@ def execute(args: argparse.Namespace) -> int:
 
     if args.page is not None and args.page.exists() and not args.page.is_dir():
         raise UserError(f"--page {args.page} is no folder")
-    found = publish(args.runs or ([RUNS] if RUNS.is_dir() else []), args.out)
-    for refusal in found.refusals:
+    publication = publish(args.runs or ([RUNS] if RUNS.is_dir() else []), args.out)
+    for refusal in publication.refusals:
         print(f"refused {refusal}", file=sys.stderr)
-    if not found.entries:
-        raise UserError(f"nothing to publish: none of {len(found.refusals)} runs qualifies")
-    runs = sum(len(entry.records) for entry in found.entries)
-    print(f"{len(found.added)} runs added, {len(found.refusals)} refused; {runs} runs in {len(found.entries)} entries")
-    print(f"{len(found.tables)} tables in {args.out}")
+    if not publication.entries:
+        raise UserError(f"nothing to publish: none of {len(publication.refusals)} runs qualifies")
+    entries = publication.entries
+    runs = sum(len(entry.records) for entry in entries)
+    print(f"{len(publication.added)} runs added, {len(publication.refusals)} refused; ", end="")
+    print(f"{runs} runs in {len(entries)} entries")
+    print(f"{len(publication.tables)} tables in {args.out}")
     page = None
     if args.page is not None:
         from leaderboards.page.page import write_page
 
-        page = write_page(found.entries, found.tables, args.page)
+        page = write_page(publication.entries, publication.tables, args.page)
         print(f"page {page}")
     if args.json:
         fields = {
-            "added": [str(folder) for folder in found.added],
-            "refused": {str(refusal.folder): list(refusal.reasons) for refusal in found.refusals},
-            "files": [str(args.out / name) for name in found.tables],
+            "added": [str(folder) for folder in publication.added],
+            "refused": {str(refusal.folder): list(refusal.reasons) for refusal in publication.refusals},
+            "files": [str(args.out / name) for name in publication.tables],
             "page": None if page is None else str(page),
         }
         print_json(fields)

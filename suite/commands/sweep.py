@@ -79,8 +79,8 @@ def execute(args: argparse.Namespace) -> int:
     _print_results(runs)
     if args.json:
         print_json({"runs": [_fields(run) for run in runs]})
-    found = {run.status for run in runs}
-    return STOPPED if found & {"waiting", "stopped"} else FAILED if "failed" in found else 0
+    statuses = {run.status for run in runs}
+    return STOPPED if statuses & {"waiting", "stopped"} else FAILED if "failed" in statuses else 0
 
 
 def _require_ray() -> None:

@@ -179,21 +179,21 @@ def collect(agent: Agent, pairs: int, reporter: Reporter) -> tuple[EvaluationSet
     drawn = random.choice(envs * iterations, min(TRAJECTORIES, envs * iterations // 2), replace=False)
     validation_B = np.arange(envs) >= envs - max(1, envs // VALIDATION)
     kept: list[dict[str, np.ndarray]] = []
-    shown: list[dict[str, np.ndarray]] = []
+    pairs_kept: list[dict[str, np.ndarray]] = []
 
     def keep(iteration: int, phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Runs a phase of Algorithm 1; of real play it keeps what is wanted."""
         result = function(*arguments)
         if phase == "collect":
-            player, trajectory, log = result
-            arrays = _arrays(jax.device_get((trajectory, player.time_step.observation, log)))
+            rollout_state, trajectory, log = result
+            arrays = _arrays(jax.device_get((trajectory, rollout_state.time_step.observation, log)))
             here = np.sort(drawn[drawn // envs == iteration] % envs)
             for env in here:
                 start = random.integers(length - steps + 1)
                 cut = {name: array[start : start + steps, env] for name, array in arrays.items() if name != "frames"}
                 kept.append(cut | {"frames": arrays["frames"][start : start + steps + 1, env]})
-            wanted = pairs * (iteration + 1) // iterations - sum(len(part["symbols"]) for part in shown)
-            shown.append(_pairs(random, arrays, np.setdiff1d(np.arange(envs), here), wanted, validation_B))
+            wanted = pairs * (iteration + 1) // iterations - sum(len(part["symbols"]) for part in pairs_kept)
+            pairs_kept.append(_pairs(random, arrays, np.setdiff1d(np.arange(envs), here), wanted, validation_B))
         return result
 
     state, taken = agent.init(start_key(config.seed)), 0
@@ -203,16 +203,16 @@ def collect(agent: Agent, pairs: int, reporter: Reporter) -> tuple[EvaluationSet
         state, taken = iterate(agent, state, key, taken, functools.partial(keep, iteration))
         reporter.update(taken, "collect", {})
     reporter.stop()
-    return EvaluationSet(**_joined(np.stack, kept)), Pairs(**_joined(np.concatenate, shown))
+    return EvaluationSet(**_joined(np.stack, kept)), Pairs(**_joined(np.concatenate, pairs_kept))
 
 
 def _joined(join: Callable[[list[np.ndarray]], np.ndarray], parts: list[dict[str, np.ndarray]]) -> dict[str, Any]:
     return {name: join([part[name] for part in parts]) for name in parts[0]}
 
 
-def _arrays(found: Any) -> dict[str, np.ndarray]:
+def _arrays(results: Any) -> dict[str, np.ndarray]:
     """One iteration's rollouts by name, [T, B, ...], of frames [T + 1, B, ...]."""
-    trajectory, last_BO, log = found
+    trajectory, last_BO, log = results
     nothing = np.zeros((*trajectory.action_TB.shape, 0), np.int32)
     return {
         "frames": np.concatenate([trajectory.observation_TB, last_BO[None]]),

@@ -55,14 +55,14 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
     out.mkdir(parents=True, exist_ok=True)
 
     grid = len(spec.observation.shape) == 3
-    found: dict[str, Rollouts] = {}
+    rollouts_of: dict[str, Rollouts] = {}
     rows, steps, codes = {}, {}, {}
     for record, run, name in zip(records, runs, _names(records), strict=True):
         reporter.message(f"imagining {len(real.action)} rollouts of {name}")
         world_model, tokenizer = run.model.world_model, run.model.tokenizer
-        found[name] = imagine(run.agent, world_model, tokenizer, whole, jax.random.key(0), start)
+        rollouts_of[name] = imagine(run.agent, world_model, tokenizer, whole, jax.random.key(0), start)
         high = spec.observation.high
-        table, summary = compare(real, found[name], run.agent.tokens, high, extractor)
+        table, summary = compare(real, rollouts_of[name], run.agent.tokens, high, extractor)
         steps[name] = pd.DataFrame(table)
         codebook = _codebook(record)
         if len(codebook):
@@ -71,7 +71,7 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
         if extractor is not None:
             summary["extractor_percent"] = 100 * extractor.accuracy
         rows[name] = {"checkpoint": run.step, **summary}
-        used = found[name].codes
+        used = rollouts_of[name].codes
         if grid and used is not None:
             picture = pictures.code_picture(run.agent.tokenizer, tokenizer, used, spec.observation.shape, high)
             pictures.save(out / f"codes-{name.replace(' ', '-').replace('/', '-')}.png", picture)
@@ -82,7 +82,7 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
         _write_table(out / "codes.csv", codes)
     pictures.curves(out / "curves.png", steps, codes)
     if grid:
-        _write_strips(out, real, found, records[0])
+        _write_strips(out, real, rollouts_of, records[0])
     return {"folder": str(out), "runs": rows}
 
 
@@ -131,9 +131,9 @@ def _write_table(path: Path, tables: dict[str, pd.DataFrame]) -> None:
     write_whole(path, whole.to_csv(index=False, lineterminator="\n").encode())
 
 
-def _write_strips(out: Path, real: EvaluationSet, found: dict[str, Rollouts], record: RunRecord) -> None:
+def _write_strips(out: Path, real: EvaluationSet, rollouts_of: dict[str, Rollouts], record: RunRecord) -> None:
     observation = record.spec.observation
-    steps = max(rollouts.steps for rollouts in found.values())
+    steps = max(rollouts.steps for rollouts in rollouts_of.values())
     for number in filmstrips.choose(real, steps, STRIPS):
         notes = ["step 0: start"]
         for t in range(steps):
@@ -143,7 +143,7 @@ def _write_strips(out: Path, real: EvaluationSet, found: dict[str, Rollouts], re
         strip = filmstrips.Strip(
             title=f"{record.config.task}, trajectory {number}. Outlined: patches that differ from the real frame.",
             real=real.frames[number, : steps + 1],
-            imagined={name: rollouts.frames[number] for name, rollouts in found.items()},
+            imagined={name: rollouts.frames[number] for name, rollouts in rollouts_of.items()},
             notes=notes,
             patch=observation.patch or observation.shape[:2],  # type: ignore[arg-type]
             high=observation.high,

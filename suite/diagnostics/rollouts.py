@@ -88,8 +88,8 @@ def imagine(
         action = real.action[first : first + CHUNK, :seen]
         missing = [(0, min(CHUNK, len(real.action)) - len(action))]  # one shape, one compilation
         padded = [np.pad(x, missing + [(0, 0)] * (x.ndim - 1), mode="edge") for x in (frames, action)]
-        found = _imagine(agent, world_model, tokenizer, *padded, jax.random.fold_in(key, first))
-        *arrays, copied, tokens = (np.asarray(x)[: len(action)] for x in jax.device_get(found))
+        batch_rollouts = _imagine(agent, world_model, tokenizer, *padded, jax.random.fold_in(key, first))
+        *arrays, copied, tokens = (np.asarray(x)[: len(action)] for x in jax.device_get(batch_rollouts))
         copies.append(copied)
         parts.append(arrays)
         if agent.tokenizer.num_codes:
@@ -145,13 +145,13 @@ def _imagine(
 
 
 def compare(
-    real: EvaluationSet, found: Rollouts, tokens: TokenSpec, high: int, read: Read | None
+    real: EvaluationSet, imagined: Rollouts, tokens: TokenSpec, high: int, read: Read | None
 ) -> tuple[list[dict[str, float]], dict[str, float]]:
     """Rollouts beside reality.
 
     Args:
       real: the evaluation set.
-      found: of a model.
+      imagined: of a model.
       tokens: tells the classes of rewards.
       high: largest value of a pixel.
       read: the symbol extractor; None: symbols are not known.
@@ -167,46 +167,46 @@ def compare(
       of the rollouts'. The summary has means over all steps, precision and recall of all steps' events together, and
       the calibration error of their probabilities.
     """
-    steps = found.steps
-    counted, shown = real.counted[:, :steps], real.frame_counted[:, :steps]
+    steps = imagined.steps
+    counted, frame_counted = real.counted[:, :steps], real.frame_counted[:, :steps]
     after, first = real.frames[:, 1 : steps + 1], real.frames[:, :1]
     seen = {
-        "": found.frames,
-        "tokenizer_": found.tokenized[:, 1:],
+        "": imagined.frames,
+        "tokenizer_": imagined.tokenized[:, 1:],
         "repeated_": np.broadcast_to(first, after.shape),
     }
-    columns = {f"{name}error": (squared_error(frames, after, high), shown) for name, frames in seen.items()}
-    right = {"": found.frames, "repeated_": np.broadcast_to(found.tokenized[:, :1], after.shape)}
+    columns = {f"{name}error": (squared_error(frames, after, high), frame_counted) for name, frames in seen.items()}
+    right = {"": imagined.frames, "repeated_": np.broadcast_to(imagined.tokenized[:, :1], after.shape)}
     for name, frames in right.items():
-        whole = (frames == found.tokenized[:, 1:]).reshape(*shown.shape, -1).all(-1)
-        columns[f"{name}frames_percent"] = (100.0 * whole, shown)
-    if found.copied is not None:
-        columns["copied_percent"] = (100.0 * found.copied, shown)
+        whole = (frames == imagined.tokenized[:, 1:]).reshape(*frame_counted.shape, -1).all(-1)
+        columns[f"{name}frames_percent"] = (100.0 * whole, frame_counted)
+    if imagined.copied is not None:
+        columns["copied_percent"] = (100.0 * imagined.copied, frame_counted)
     if read is not None:
         truth = real.symbols[:, :steps]
         for name, frames in {**seen, "real_": after}.items():
             percent = 100 * (read(frames) == truth).mean(-1)
-            columns[f"{name}symbols_percent"] = (percent, shown)
+            columns[f"{name}symbols_percent"] = (percent, frame_counted)
 
-    class_of = {name: np.asarray(tokens.reward_to_class(x)) for name, x in _rewards(real, found).items()}
+    class_of = {name: np.asarray(tokens.reward_to_class(x)) for name, x in _rewards(real, imagined).items()}
     none = int(tokens.reward_to_class(jnp.zeros(())))
     ended = real.terminated[:, :steps]
     events = {
-        "reward": (class_of["imagined"], class_of["real"], none, 1 - found.reward_odds[..., none]),
-        "termination": (found.terminated.astype(int), ended.astype(int), 0, found.termination_odds),
+        "reward": (class_of["imagined"], class_of["real"], none, 1 - imagined.reward_odds[..., none]),
+        "termination": (imagined.terminated.astype(int), ended.astype(int), 0, imagined.termination_odds),
     }
     summary: dict[str, float] = {}
     shares: dict[str, list[float]] = {}
-    for name, (imagined, true, nothing, odds) in events.items():
+    for name, (foretold, true, nothing, odds) in events.items():
         columns |= {
-            f"{name}_percent": (100.0 * (imagined == true), counted),
+            f"{name}_percent": (100.0 * (foretold == true), counted),
             f"{name}_frequency": (100.0 * (true != nothing), counted),
             f"{name}_probability": (100.0 * odds, counted),
         }
-        at_step = [precision_recall(x[c], y[c], nothing) for x, y, c in zip(imagined.T, true.T, counted.T, strict=True)]
+        at_step = [precision_recall(x[c], y[c], nothing) for x, y, c in zip(foretold.T, true.T, counted.T, strict=True)]
         for measure, values in zip(("precision", "recall"), zip(*at_step, strict=True), strict=True):
             shares[f"{name}_{measure}_percent"] = [100 * value for value in values]
-        precision, recall = precision_recall(imagined[counted], true[counted], nothing)
+        precision, recall = precision_recall(foretold[counted], true[counted], nothing)
         summary |= {
             f"{name}_precision_percent": 100 * precision,
             f"{name}_recall_percent": 100 * recall,
@@ -215,9 +215,9 @@ def compare(
     per_step = {name: mean_per_step(*column) for name, column in columns.items()} | shares
     rows = [{"step": t + 1, **{name: float(values[t]) for name, values in per_step.items()}} for t in range(steps)]
     overall = {name: _mean(*column) for name, column in columns.items()}
-    all_frames = np.pad(shown, ((0, 0), (1, 0)), constant_values=True)
-    overall["tokenizer_error"] = _mean(squared_error(found.tokenized, real.frames[:, : steps + 1], high), all_frames)
-    codes = {} if found.codes is None else {"codes_used": len(found.codes)}
+    all_frames = np.pad(frame_counted, ((0, 0), (1, 0)), constant_values=True)
+    overall["tokenizer_error"] = _mean(squared_error(imagined.tokenized, real.frames[:, : steps + 1], high), all_frames)
+    codes = {} if imagined.codes is None else {"codes_used": len(imagined.codes)}
     return rows, {"steps": steps, "trajectories": len(counted), **overall, **summary, **codes}
 
 
@@ -225,8 +225,8 @@ def _mean(values: np.ndarray, counted: np.ndarray) -> float:
     return float(values[counted].mean()) if counted.any() else np.nan
 
 
-def _rewards(real: EvaluationSet, found: Rollouts) -> dict[str, jax.Array]:
-    return {"real": jnp.asarray(real.reward[:, : found.steps]), "imagined": jnp.asarray(found.reward)}
+def _rewards(real: EvaluationSet, imagined: Rollouts) -> dict[str, jax.Array]:
+    return {"real": jnp.asarray(real.reward[:, : imagined.steps]), "imagined": jnp.asarray(imagined.reward)}
 
 
 def squared_error(frames: np.ndarray, others: np.ndarray, high: int) -> np.ndarray:

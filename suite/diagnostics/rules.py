@@ -20,7 +20,7 @@ from suite.agent.dyna import Agent
 from suite.interface.environment import State, TimeStep
 from suite.interface.turns import CHANCE, Turn
 from suite.policy.actor_critic import UniformPolicy
-from suite.policy.ppo import Learner
+from suite.policy.ppo import PolicyTrainState
 from suite.records.record import RunRecord
 from suite.runs.saved_model import restore
 from suite.runtime.errors import UserError
@@ -30,7 +30,7 @@ GAMES = 1_000
 
 
 @struct.dataclass
-class Comparison:
+class RuleCheck:
     """Imagined events beside the real ones that the same event led to; all [T, B].
 
     Attributes:
@@ -67,7 +67,7 @@ class Games:
       state, turn: of the real environments.
       imagined: what the model shows instead.
       hidden_BH: the policy's memory before it sees that.
-      alive_B: bool; see `Comparison.counted`.
+      alive_B: bool; see `RuleCheck.counted`.
     """
 
     state: State
@@ -78,7 +78,13 @@ class Games:
 
 
 def rules_kept(
-    agent: Agent, learner: Learner, world_model: nnx.State, tokenizer: Any, key: jax.Array, games: int, uniform: bool
+    agent: Agent,
+    policy_state: PolicyTrainState,
+    world_model: nnx.State,
+    tokenizer: Any,
+    key: jax.Array,
+    games: int,
+    uniform: bool,
 ) -> dict[str, float]:
     """How well imagined games keep the rules.
 
@@ -88,7 +94,7 @@ def rules_kept(
 
     Args:
       agent: of a two-player task; the event alone must determine what its environment does.
-      learner: whose policy plays.
+      policy_state: whose policy plays.
       world_model, tokenizer: their parameters and state.
       key: of the games.
       games: at least so many.
@@ -103,21 +109,21 @@ def rules_kept(
       `events`.
     """
     seats = agent.batched.num_envs
-    parts: list[Comparison] = []
+    parts: list[RuleCheck] = []
     for i in range(-(-games // seats)):
         start_key, dream_key = jax.random.split(jax.random.fold_in(key, i))
-        state, now = _start(agent, learner, start_key, uniform), 0
+        state, now = _start(agent, policy_state, start_key, uniform), 0
         columns = []
         while now == 0 or bool(state.alive_B.any()):  # a real game's end ends it, whatever the model thinks
             step_key = jax.random.fold_in(dream_key, now)
-            state, compared = _go_on(agent, learner, world_model, tokenizer, step_key, state, uniform)
+            state, compared = _go_on(agent, policy_state, world_model, tokenizer, step_key, state, uniform)
             columns.append(jax.device_get(compared))
             now += 1
         parts.append(jax.tree.map(lambda *x: np.concatenate(x), *columns))
     return _summary(parts)
 
 
-def _summary(parts: list[Comparison]) -> dict[str, float]:
+def _summary(parts: list[RuleCheck]) -> dict[str, float]:
     """Of batches of games of different lengths."""
 
     def flat(name: str) -> np.ndarray:
@@ -163,46 +169,46 @@ def _largest_z(outcome_N: np.ndarray, odds_NC: np.ndarray) -> float:
     return float(np.abs((count_C - odds.sum(0))[open_C] / np.sqrt(variance_C[open_C])).max())
 
 
-def _policy(agent: Agent, learner: Learner, uniform: bool) -> Any:
-    return UniformPolicy(agent.spec.num_actions) if uniform else nnx.merge(agent.policy_graph, learner.params)
+def _policy(agent: Agent, policy_state: PolicyTrainState, uniform: bool) -> Any:
+    return UniformPolicy(agent.spec.num_actions) if uniform else nnx.merge(agent.policy_graph, policy_state.params)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
-def _start(agent: Agent, learner: Learner, key: jax.Array, uniform: bool) -> Games:
+def _start(agent: Agent, policy_state: PolicyTrainState, key: jax.Array, uniform: bool) -> Games:
     """Games at their first frame, where imagined and real ones agree."""
-    state, shown = agent.batched.reset(key)
+    state, time_step = agent.batched.reset(key)
     batch = agent.batched.num_envs
-    hidden_BH = _policy(agent, learner, uniform).initial_hidden(batch)
-    assert shown.turn is not None
-    return Games(state, shown.turn, shown, hidden_BH, jnp.ones(batch, bool))
+    hidden_BH = _policy(agent, policy_state, uniform).initial_hidden(batch)
+    assert time_step.turn is not None
+    return Games(state, time_step.turn, time_step, hidden_BH, jnp.ones(batch, bool))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 6))
 def _go_on(
     agent: Agent,
-    learner: Learner,
+    policy_state: PolicyTrainState,
     world_model: nnx.State,
     tokenizer: Any,
     key: jax.Array,
     games: Games,
     uniform: bool,
-) -> tuple[Games, Comparison]:
+) -> tuple[Games, RuleCheck]:
     """One dream, from where the imagined games are, and what the real ones make of its events."""
-    policy, model = _policy(agent, learner, uniform), nnx.merge(agent.world_model_graph, world_model)
+    policy, model = _policy(agent, policy_state, uniform), nnx.merge(agent.world_model_graph, world_model)
     start, horizon = games.imagined, agent.config.imagination.horizon
     dream = agent.dream_from(model, tokenizer, start.observation, start.turn, horizon)
-    player = play.start(policy, dream, key, burn_in=0)
-    time_step = dataclasses.replace(player.time_step, first=start.first)
-    player = dataclasses.replace(player, time_step=time_step, hidden_BH=games.hidden_BH)
-    player, trajectory, _ = play.rollout(key, policy, learner.targets, dream, player, horizon)
+    rollout_state = play.start(policy, dream, key, burn_in=0)
+    time_step = dataclasses.replace(rollout_state.time_step, first=start.first)
+    rollout_state = dataclasses.replace(rollout_state, time_step=time_step, hidden_BH=games.hidden_BH)
+    rollout_state, trajectory, _ = play.rollout(key, policy, policy_state.targets, dream, rollout_state, horizon)
     # What was imagined after each event.
     seen = jax.tree.map(
         lambda during, last: jnp.concatenate([during[1:], last[None]]),
         (trajectory.observation_TB, trajectory.turn_TB),
-        (player.time_step.observation, player.time_step.turn),
+        (rollout_state.time_step.observation, rollout_state.time_step.turn),
     )
 
-    def event(carry: tuple[State, Turn, jax.Array], imagined: Any) -> tuple[Any, Comparison]:
+    def event(carry: tuple[State, Turn, jax.Array], imagined: Any) -> tuple[Any, RuleCheck]:
         state, real, alive_B = carry
         event_B, turn, (observation, seen_turn), reward_B, terminated_B, step_key = imagined
         possible_BN = jnp.concatenate([real.legal_A, real.chance_C > 0], axis=1)
@@ -213,7 +219,7 @@ def _go_on(
         wanted = after.turn
         assert wanted is not None
         ended_B = after.terminated | after.truncated
-        result = Comparison(
+        result = RuleCheck(
             counted=alive_B,
             legal=legal_B,
             player=seen_turn.player == wanted.player,
@@ -241,7 +247,7 @@ def _go_on(
         keys,
     )
     (state, turn, alive_B), compared = jax.lax.scan(event, (games.state, games.turn, games.alive_B), imagined)
-    return Games(state, turn, player.time_step, player.hidden_BH, alive_B), compared
+    return Games(state, turn, rollout_state.time_step, rollout_state.hidden_BH, alive_B), compared
 
 
 def rules_of_run(folder: Path, games: int = GAMES, reporter: Reporter | None = None) -> dict[str, dict[str, float]]:
@@ -256,9 +262,9 @@ def rules_of_run(folder: Path, games: int = GAMES, reporter: Reporter | None = N
         raise UserError(f"{folder} has no world model of a two-player game")
     saved = restore(record, reporter)
     model = saved.model
-    play_as = functools.partial(rules_kept, saved.agent, model.learner, model.world_model, model.tokenizer)
-    found = {}
+    play_as = functools.partial(rules_kept, saved.agent, model.policy_state, model.world_model, model.tokenizer)
+    kept = {}
     for name in ("agent", "uniform"):
         reporter.message(f"imagining {games} games, {name} play")
-        found[name] = play_as(jax.random.key(0), games, uniform=name == "uniform")
-    return found
+        kept[name] = play_as(jax.random.key(0), games, uniform=name == "uniform")
+    return kept

@@ -48,7 +48,7 @@ class Batched:
         ended_B = stepped.terminated | stepped.truncated
         # Indices of the environments that ended come first; the loop visits only those.
         order_B = jnp.argsort(~ended_B, stable=True)
-        shown = {"observation": stepped.observation, "turn": stepped.turn}
+        visible = {"observation": stepped.observation, "turn": stepped.turn}
 
         def reset_one(i, carry):
             index = order_B[i]
@@ -56,8 +56,8 @@ class Batched:
             fresh_shown = {"observation": fresh.observation, "turn": fresh.turn}
             return jax.tree.map(lambda old, new: old.at[index].set(new), carry, (fresh_state, fresh_shown))
 
-        state, shown = jax.lax.fori_loop(0, ended_B.sum(), reset_one, (state, shown))
-        return state, dataclasses.replace(stepped, first=ended_B, **shown)
+        state, visible = jax.lax.fori_loop(0, ended_B.sum(), reset_one, (state, visible))
+        return state, dataclasses.replace(stepped, first=ended_B, **visible)
 
     def resumed(self, state: State, observation_BO: jax.Array, first_B: jax.Array, turn_B: Turn | None) -> Resumed:
         """The same environments, at the given states: what was seen there, whether it opens an episode, whose turn."""

@@ -122,29 +122,29 @@ class HostEnvironment:
         return state, self._time_step(state, first=jnp.zeros((), bool))
 
     def _time_step(self, state: HostState, first: jax.Array) -> TimeStep:
-        shown = jax.pure_callback(
+        host_step = jax.pure_callback(
             self._visit, self._result, state.seed, state.actions, state.length, vmap_method="broadcast_all"
         )
-        observation, reward, turn = shown.observation, shown.reward, None
+        observation, reward, turn = host_step.observation, host_step.reward, None
         statistics = {}
         if state.seat is not None:
             turn = Turn(
-                player=shown.player,
+                player=host_step.player,
                 seat=state.seat,
-                legal_A=shown.legal_A,
-                chance_C=shown.chance_C,
+                legal_A=host_step.legal_A,
+                chance_C=host_step.chance_C,
                 opponent_observation=observation[2 - state.seat],
             )
             observation, reward = observation[state.seat - 1], reward[state.seat - 1]
-            if shown.raw_return is not None:
-                statistics["raw_return"] = shown.raw_return[state.seat - 1]
+            if host_step.raw_return is not None:
+                statistics["raw_return"] = host_step.raw_return[state.seat - 1]
             if "seat" in dict(self.spec.statistics):
                 statistics["seat"] = state.seat.astype(jnp.float32)
         return TimeStep(
             observation=observation,
             reward=reward,
-            terminated=shown.terminated,
-            truncated=(shown.truncated | (state.length >= self.limit)) & ~shown.terminated,
+            terminated=host_step.terminated,
+            truncated=(host_step.truncated | (state.length >= self.limit)) & ~host_step.terminated,
             first=first,
             final_observation=observation,
             statistics=statistics,
@@ -188,15 +188,15 @@ class EnginePool:
         seed, history = place
         before = (seed, history[:-4])
         if place in self._live:
-            engine, shown = self._live.pop(place)
+            engine, host_step = self._live.pop(place)
         elif history and before in self._live:
-            engine, shown = self._live.pop(before)
-            shown = self._play(engine, shown, history[-4:])
+            engine, host_step = self._live.pop(before)
+            host_step = self._play(engine, host_step, history[-4:])
         else:
             engine = self._free_engine()
-            shown = self._play(engine, engine.reset(seed), history)
-        self._live[place] = engine, shown
-        return shown
+            host_step = self._play(engine, engine.reset(seed), history)
+        self._live[place] = engine, host_step
+        return host_step
 
     def _free_engine(self) -> HostEngine:
         """A new one, or the one not asked for for the longest time."""
@@ -204,34 +204,34 @@ class EnginePool:
             return self._make_engine()
         return self._live.popitem(last=False)[1][0]
 
-    def _play(self, engine: HostEngine, shown: HostStep, history: bytes) -> HostStep:
+    def _play(self, engine: HostEngine, host_step: HostStep, history: bytes) -> HostStep:
         for action in np.frombuffer(history, np.int32).tolist():
-            if shown.terminated or shown.truncated:
+            if host_step.terminated or host_step.truncated:
                 raise RunError("a step after the end of an episode, or an engine that its seed does not determine")
-            shown = engine.step(action)
-        return shown
+            host_step = engine.step(action)
+        return host_step
 
 
 def random_steps(engine: HostEngine, num_actions: int, steps: int) -> Iterator[HostStep]:
     """What `steps` random legal steps and the resets between them show, always the same."""
     random = np.random.default_rng(0)
-    shown = engine.reset(0)
-    yield shown
+    host_step = engine.reset(0)
+    yield host_step
     for seed in range(1, steps + 1):
-        if shown.player == CHANCE:
-            action = random.choice(len(shown.chance_C), p=shown.chance_C)
+        if host_step.player == CHANCE:
+            action = random.choice(len(host_step.chance_C), p=host_step.chance_C)
         else:
-            action = random.choice(num_actions if shown.legal_A is None else np.flatnonzero(shown.legal_A))
-        shown = engine.step(int(action))
-        yield shown
-        if shown.terminated or shown.truncated:
-            shown = engine.reset(seed)
-            yield shown
+            action = random.choice(num_actions if host_step.legal_A is None else np.flatnonzero(host_step.legal_A))
+        host_step = engine.step(int(action))
+        yield host_step
+        if host_step.terminated or host_step.truncated:
+            host_step = engine.reset(seed)
+            yield host_step
 
 
 def random_rewards(engine: HostEngine, num_actions: int, steps: int = 1000) -> set[float]:
     """The rewards that `random_steps` pay, and 0: of games, both players'."""
-    return {0.0}.union(*(np.ravel(shown.reward).tolist() for shown in random_steps(engine, num_actions, steps)))
+    return {0.0}.union(*(np.ravel(host_step.reward).tolist() for host_step in random_steps(engine, num_actions, steps)))
 
 
 def reward_classes(rewards: Iterable[float]) -> tuple[float, ...]:

@@ -141,7 +141,7 @@ def _pool_axis_backward(axis: int, size: int, which: jax.Array, slope: jax.Array
 _pool_axis.defvjp(_pool_axis_forward, _pool_axis_backward)
 
 
-class ResidualBlock(nnx.Module):
+class PolicyBlock(nnx.Module):
     """x + `convs` times [activation, norm, 3x3 convolution]; channels unchanged."""
 
     def __init__(self, channels: int, config: PolicyConfig, dtype: Any, rngs: nnx.Rngs):
@@ -165,7 +165,7 @@ class ImpalaStack(nnx.Module):
         self.first = first
         self.norm = Norm(inputs, _NORM_AXES[config.cnn_norm], dtype)
         self.conv = Conv3x3(inputs, outputs, dtype, rngs)
-        self.blocks = nnx.List(ResidualBlock(outputs, config, dtype, rngs) for _ in range(config.blocks_per_stack))
+        self.blocks = nnx.List(PolicyBlock(outputs, config, dtype, rngs) for _ in range(config.blocks_per_stack))
 
     def __call__(self, x_NHWC: jax.Array) -> jax.Array:
         """[N, ceil(H/2), ceil(W/2), outputs]."""

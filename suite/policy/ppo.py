@@ -180,7 +180,7 @@ class TargetStatistics:
 
 
 @struct.dataclass
-class Learner:
+class PolicyTrainState:
     """All that learning a policy carries along: parameters, optimizer state (None in `acting`), target statistics."""
 
     params: nnx.State
@@ -188,8 +188,8 @@ class Learner:
     targets: TargetStatistics
 
     @classmethod
-    def create(cls, ppo: PPOConfig, optimizer: optax.GradientTransformation, params: nnx.State) -> Learner:
-        """A fresh learner of `params`, the state of `nnx.split(policy)`."""
+    def create(cls, ppo: PPOConfig, optimizer: optax.GradientTransformation, params: nnx.State) -> PolicyTrainState:
+        """A fresh policy_state of `params`, the state of `nnx.split(policy)`."""
         return cls(
             params,
             optimizer.init(params),
@@ -197,7 +197,7 @@ class Learner:
         )
 
     @property
-    def acting(self) -> Learner:
+    def acting(self) -> PolicyTrainState:
         """What acting needs: without the optimizer, so that training and evaluation share one compiled program."""
         return dataclasses.replace(self, optimizer=None)
 
@@ -211,20 +211,20 @@ def update(
     ppo: PPOConfig,
     optimizer: optax.GradientTransformation,
     graphdef: nnx.GraphDef,
-    learner: Learner,
+    policy_state: PolicyTrainState,
     trajectory: Trajectory,
     *,
     epochs: int,
     minibatches: int,
     entropy_coefficient: float,
     remaining: tuple[jax.Array, jax.Array] | None = None,
-) -> tuple[Learner, dict[str, jax.Array]]:
+) -> tuple[PolicyTrainState, dict[str, jax.Array]]:
     """Algorithm 3: `epochs` passes over `minibatches` contiguous groups of environments, unshuffled (note 9).
 
     With `remaining`, float32 shares of the budget that are left before and after these updates, the learning rate
     falls from the first to the second share of itself, linearly by minibatch (note 11).
 
-    Each minibatch runs the network over all T steps again, from `trajectory.hidden_BH`. Returns the learner and
+    Each minibatch runs the network over all T steps again, from `trajectory.hidden_BH`. Returns the policy_state and
     the float32 scalars that `METRICS` names, those of the loss averaged over all minibatch updates. Raises
     ValueError if `minibatches` does not divide B.
     """
@@ -246,10 +246,10 @@ def update(
         legal_TBA=trajectory.legal_TBA,
     )
 
-    def minibatch_update(learner: Learner, inputs: tuple[jax.Array, jax.Array | None]):
+    def minibatch_update(policy_state: PolicyTrainState, inputs: tuple[jax.Array, jax.Array | None]):
         index, rate = inputs
         part, hidden_BH = _environments(batch, trajectory.hidden_BH, index * size, size)
-        targets = learner.targets.update(part.target_TB, part.known_TB, ppo.target_decay)
+        targets = policy_state.targets.update(part.target_TB, part.known_TB, ppo.target_decay)
         part = dataclasses.replace(part, target_TB=targets.standardize(part.target_TB))
 
         def loss_of(params: nnx.State):
@@ -257,23 +257,23 @@ def update(
             output, _ = policy(part.observation_TB, part.first_TB, hidden_BH, part.acting_TB)
             return _loss(ppo, output, part, entropy_coefficient)
 
-        gradients, metrics = jax.grad(loss_of, has_aux=True)(learner.params)
+        gradients, metrics = jax.grad(loss_of, has_aux=True)(policy_state.params)
         metrics["gradient_norm"] = optax.tree.norm(gradients)
         with jax.numpy_dtype_promotion("standard"):  # Optax raises floats to integer powers
-            changes, state = optimizer.update(gradients, learner.optimizer, learner.params)
+            changes, state = optimizer.update(gradients, policy_state.optimizer, policy_state.params)
         if rate is not None:
             changes = jax.tree.map(lambda change: rate * change, changes)
-        return Learner(optax.apply_updates(learner.params, changes), state, targets), metrics
+        return PolicyTrainState(optax.apply_updates(policy_state.params, changes), state, targets), metrics
 
     order = jnp.tile(jnp.arange(minibatches), epochs)
     rates = None if remaining is None else jnp.linspace(*remaining, len(order), endpoint=False)
-    learner, metrics = jax.lax.scan(minibatch_update, learner, (order, rates))
+    policy_state, metrics = jax.lax.scan(minibatch_update, policy_state, (order, rates))
     metrics = {name: value.mean() for name, value in metrics.items()}
 
     _, target_std, _ = _moments(batch.target_TB, known_TB)
     metrics["explained_variance"] = 1.0 - jnp.square(std) / (jnp.square(target_std) + 1e-8)
-    metrics["target_mean"], metrics["target_std"] = learner.targets.corrected()
-    return learner, metrics
+    metrics["target_mean"], metrics["target_std"] = policy_state.targets.corrected()
+    return policy_state, metrics
 
 
 @struct.dataclass

@@ -30,7 +30,7 @@ CHUNK = 1 << 24
 
 
 @dataclasses.dataclass(frozen=True)
-class Restored:
+class Checkpoint:
     """A checkpoint read back. `resume` is None if it was not asked for or was dropped; `warnings` are for the user."""
 
     step: int
@@ -71,7 +71,7 @@ def save(folder: Path, step: int, model: Any, resume: Any, host: dict[str, Any],
         shutil.rmtree(folder / _name(other))
 
 
-def restore_latest(folder: Path, model_template: Any, resume_template: Any = None) -> Restored | None:
+def restore_latest(folder: Path, model_template: Any, resume_template: Any = None) -> Checkpoint | None:
     """The newest checkpoint that is whole, or None if there is none.
 
     Args:
@@ -90,7 +90,7 @@ def restore_latest(folder: Path, model_template: Any, resume_template: Any = Non
             warnings.append(f"checkpoint at step {step:,} is damaged ({damage}) and is not used")
             continue
         wanted = resume_template is not None and (path / "resume").exists()
-        return Restored(
+        return Checkpoint(
             step=step,
             model=_restore_tree(path / "model", model_template),
             resume=_restore_tree(path / "resume", resume_template) if wanted else None,
@@ -171,16 +171,16 @@ def _restore_tree(path: Path, template: Any) -> Any:
     wanted = {
         name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device) for name, leaf in _leaves(template).items()
     }
-    found: dict[str, Any] = {}
+    arrays: dict[str, Any] = {}
     with _orbax() as checkpointer:
         if wanted:
             stored = {name: leaf.shape for name, leaf in _metadata(checkpointer, path).items()}
             if misfit := next((n for n in wanted.keys() | stored if not _fits(n, wanted, stored)), None):
                 raise UserError(f"{path} does not fit this version or configuration: {misfit}")
             arguments = ocp.checkpoint_utils.construct_restore_args(wanted)
-            found = checkpointer.restore(path.absolute(), args=ocp.args.PyTreeRestore(wanted, restore_args=arguments))
+            arrays = checkpointer.restore(path.absolute(), args=ocp.args.PyTreeRestore(wanted, restore_args=arguments))
     leaves = [
-        _unbound(found[name]) if (name := jax.tree_util.keystr(key)) in found else jnp.zeros(leaf.shape, leaf.dtype)
+        _unbound(arrays[name]) if (name := jax.tree_util.keystr(key)) in arrays else jnp.zeros(leaf.shape, leaf.dtype)
         for key, leaf in flat
     ]
     return jax.tree_util.tree_unflatten(structure, leaves)

@@ -13,7 +13,7 @@ from typing import Any
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "flashbax", "numpy", "world-model-suite")
 
 
-def surroundings() -> dict[str, Any]:
+def provenance() -> dict[str, Any]:
     """Versions, commit and device, as they stand in record.json."""
     import jax
 

@@ -32,9 +32,9 @@ from pydantic import ValidationError
 from suite import registry
 from suite.configuration.overrides import dotted, first_problem
 from suite.configuration.schema import Config
-from suite.records.provenance import package_version, peak_memory, surroundings
+from suite.records.provenance import package_version, peak_memory, provenance
 from suite.records.schema import SCHEMA, ProtocolFields, RecordFields, read_json, write_json
-from suite.records.tables import Table
+from suite.records.tables import CsvTable
 from suite.runtime.errors import RunError, UserError
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ class RunRecord:
         self.folder, self.config, self.fields, self._lock = folder, config, fields, lock
         self._spec = spec
         self._tables = {
-            name: Table(folder / f"{name}.csv", columns) for name, columns in fields.columns.items() if lock
+            name: CsvTable(folder / f"{name}.csv", columns) for name, columns in fields.columns.items() if lock
         }
         self._events: Any = None
         self._purge_step: int | None = None
@@ -165,7 +165,7 @@ class RunRecord:
             ended=None,
             wall_clock_seconds={"total": 0.0},
             peak_memory_bytes={},
-            **surroundings(),
+            **provenance(),
             resumed=[],
         )
         write_json(folder / "config.json", config.as_dict())
@@ -275,10 +275,10 @@ class RunRecord:
         assert self._lock is not None, "opened for reading only"
         held = os.fstat(self._lock.fileno())
         try:
-            found = (self.folder / LOCK).stat()
+            present = (self.folder / LOCK).stat()
         except OSError:
-            found = None
-        if found is None or (held.st_dev, held.st_ino) != (found.st_dev, found.st_ino):
+            present = None
+        if present is None or (held.st_dev, held.st_ino) != (present.st_dev, present.st_ino):
             raise RunError(f"{self.folder} was removed or replaced while this run was writing into it")
 
     def rewind(self, step: int) -> int:
@@ -292,10 +292,10 @@ class RunRecord:
         moved = 0
         for name, columns in self.fields.columns.items():
             moved += self._tables[name].rewind(step, aside / f"{name}.csv")
-            self._tables[name] = Table(self.folder / f"{name}.csv", columns)
+            self._tables[name] = CsvTable(self.folder / f"{name}.csv", columns)
         if not self._new:  # a run that has only just begun is not resumed
             self._purge_step = step + 1
-            resumed = {"step": step, "date": _now(), **surroundings()}
+            resumed = {"step": step, "date": _now(), **provenance()}
             self.update(steps=step, resumed=[*self.fields.resumed, resumed])
         return moved
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 
-class Table:
+class CsvTable:
     """A CSV file whose first column is `step` and whose columns never change.
 
     Rows hold nothing but what they are given, and floats are written so that reading them back gives the same

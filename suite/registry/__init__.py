@@ -149,7 +149,7 @@ def _find_task(id: str) -> TaskEntry:
 
 def _with_plugins(own: tuple[Entry, ...], group: str, kind: type[Entry]) -> dict[str, Entry]:
     """Entries by id; ours cannot be replaced by another distribution's."""
-    found = {}
+    plugins = {}
     for point in _entry_points(group):
         try:
             entry = point.load()
@@ -157,8 +157,8 @@ def _with_plugins(own: tuple[Entry, ...], group: str, kind: type[Entry]) -> dict
             raise UserError(f"entry point {point.name!r} of {group} cannot be loaded: {error}") from error
         if not isinstance(entry, kind):
             raise UserError(f"entry point {point.name!r} of {group} is no {kind.__name__}")
-        found[entry.id] = entry
-    return {entry.id: entry for entry in own} | {id: e for id, e in found.items() if id not in {o.id for o in own}}
+        plugins[entry.id] = entry
+    return {entry.id: entry for entry in own} | {id: e for id, e in plugins.items() if id not in {o.id for o in own}}
 
 
 @functools.cache  # reads the metadata of every installed distribution

@@ -14,7 +14,7 @@ from suite.agent.algorithm import evaluation_key
 from suite.agent.dyna import Agent
 from suite.agent.rollout import EpisodeLog
 from suite.interface.environment import EnvironmentSpec
-from suite.policy.ppo import Learner
+from suite.policy.ppo import PolicyTrainState
 from suite.records.record import RunRecord
 from suite.runs.saved_model import restore
 from suite.runtime.reporting import Reporter
@@ -50,7 +50,9 @@ def episode_rows(
     return rows, int(log.counts_TB.sum())
 
 
-def play_episodes(agent: Any, learner: Learner | None, key: jax.Array, episodes: int) -> list[dict[str, Any]]:
+def play_episodes(
+    agent: Any, policy_state: PolicyTrainState | None, key: jax.Array, episodes: int
+) -> list[dict[str, Any]]:
     """At least `episodes` whole episodes: the first of each of N_env environments, as often as it takes.
 
     Taking each environment's first episode, however long, keeps short episodes from being over-counted. Rows have
@@ -59,12 +61,12 @@ def play_episodes(agent: Any, learner: Learner | None, key: jax.Array, episodes:
     rows: list[dict[str, Any]] = []
     while len(rows) < episodes:
         key, start_key = jax.random.split(key)
-        player = agent.start(learner, start_key)
+        rollout_state = agent.start(policy_state, start_key)
         unfinished_B = np.ones(agent.batched.num_envs, bool)
         step = 0
         while unfinished_B.any():
             key, play_key = jax.random.split(key)
-            player, _, log = agent.collect(learner, player, play_key)
+            rollout_state, _, log = agent.collect(policy_state, rollout_state, play_key)
             log = jax.device_get(log)
             earlier_TB = np.cumsum(log.ended_TB, axis=0) - log.ended_TB  # ends before each step
             ended_TB = log.ended_TB & (earlier_TB == 0) & unfinished_B
@@ -92,12 +94,14 @@ def evaluate(folder: Path, episodes: int | None, reporter: Reporter) -> dict[str
     with RunRecord.open(folder) as record:
         run = restore(record, reporter)
         episodes = episodes or record.config.evaluation.episodes
-        return record_evaluation(record, run.agent, run.model.learner, run.step, episodes)
+        return record_evaluation(record, run.agent, run.model.policy_state, run.step, episodes)
 
 
-def record_evaluation(record: RunRecord, agent: Agent, learner: Learner, step: int, episodes: int) -> dict[str, Any]:
+def record_evaluation(
+    record: RunRecord, agent: Agent, policy_state: PolicyTrainState, step: int, episodes: int
+) -> dict[str, Any]:
     """Plays whole episodes with the policy of `step`, records them, and returns their scores."""
-    rows = play_episodes(agent, learner, evaluation_key(record.config.seed, step), episodes)
+    rows = play_episodes(agent, policy_state, evaluation_key(record.config.seed, step), episodes)
     record.append_evaluation({**row, "step": step} for row in rows)
     scores = registry.task(record.config.task).scores()(pd.DataFrame(rows), None, agent.spec)
     return {"step": step, "episodes": len(rows), **scores}

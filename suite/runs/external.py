@@ -39,8 +39,8 @@ class ExternalPolicy:
         scores = np.asarray(self.policy.preferences(observation_B, first_B, acting_B), np.float32)
         expected = (len(observation_B), self.spec.num_actions)
         if scores.shape != expected or np.isnan(scores).any():
-            shown = "nan" if scores.shape == expected else f"shape {list(scores.shape)}"
-            raise UserError(f"preferences(...) gave {shown}, expected numbers of shape {list(expected)}")
+            gave = "nan" if scores.shape == expected else f"shape {list(scores.shape)}"
+            raise UserError(f"preferences(...) gave {gave}, expected numbers of shape {list(expected)}")
         return np.maximum(scores, -1e8)  # an action's -inf; what is illegal is further below
 
     def initial_hidden(self, batch: int) -> jax.Array:
@@ -72,16 +72,16 @@ class Contest:
         self.policy, self.batched, self.spec = policy, batched, batched.spec
 
     @functools.partial(jax.jit, static_argnums=0)
-    def start(self, learner: None, key: jax.Array) -> play.Player:
-        """A player in fresh environments."""
+    def start(self, policy_state: None, key: jax.Array) -> play.RolloutState:
+        """The start of a rollout in fresh environments."""
         return play.start(self.policy, self.batched, key, 0)
 
     @functools.partial(jax.jit, static_argnums=0)
     def collect(
-        self, learner: None, player: play.Player, key: jax.Array
-    ) -> tuple[play.Player, Trajectory, play.EpisodeLog]:
+        self, policy_state: None, rollout_state: play.RolloutState, key: jax.Array
+    ) -> tuple[play.RolloutState, Trajectory, play.EpisodeLog]:
         """A rollout."""
-        return play.rollout(key, self.policy, TargetStatistics.create(), self.batched, player, EVENTS)
+        return play.rollout(key, self.policy, TargetStatistics.create(), self.batched, rollout_state, EVENTS)
 
 
 def evaluate_policy(task: str, reference: str, episodes: int | None, reporter: Reporter) -> dict[str, Any]:
@@ -118,14 +118,14 @@ def _load(reference: str, spec: EnvironmentSpec) -> Any:
         raise UserError(f"--policy={reference}: expected module:Class")
     sys.path.insert(0, str(Path.cwd()))
     try:
-        found = importlib.import_module(module)
+        imported = importlib.import_module(module)
     except ImportError as error:
         raise UserError(f"--policy={reference}: cannot import {module!r}: {error}") from error
     finally:
         sys.path.pop(0)
-    if not hasattr(found, name):
-        raise UserError(f"--policy={reference}: {module} has no {name!r}; {did_you_mean(name, vars(found))}")
-    policy = getattr(found, name)(spec)
+    if not hasattr(imported, name):
+        raise UserError(f"--policy={reference}: {module} has no {name!r}; {did_you_mean(name, vars(imported))}")
+    policy = getattr(imported, name)(spec)
     if not callable(getattr(policy, "preferences", None)):
         raise UserError(f"--policy={reference}: it has no method preferences(observation, first, acting)")
     return policy

@@ -10,15 +10,18 @@ from flax import struct
 
 from suite import registry
 from suite.agent.dyna import Agent
+from suite.agent.replay import ReplayState
+from suite.agent.rollout import RolloutState
 from suite.agent.state import TrainState
 from suite.configuration.schema import CheckpointConfig, Config, EvaluationConfig
 from suite.interface.tokens import TokenizerState
-from suite.policy.ppo import Learner
+from suite.policy.ppo import PolicyTrainState
 from suite.records import checkpoint
 from suite.records.record import RunRecord
 from suite.runtime.compilation import enable_compilation_cache
 from suite.runtime.errors import UserError
 from suite.runtime.reporting import Reporter
+from suite.world_model.training import WorldModelTrainState
 
 
 @struct.dataclass
@@ -40,17 +43,69 @@ class SavedModel:
     @classmethod
     def of(cls, state: TrainState) -> SavedModel:
         """The part of `state` that is saved as the model."""
-        learner, model = state.learner, state.world_model
-        return cls(learner.params, learner.targets, state.tokenizer, None if model is None else model.dreaming)
+        policy, model = state.policy, state.world_model
+        return cls(policy.params, policy.targets, state.tokenizer, None if model is None else model.dreaming)
 
     @property
-    def learner(self) -> Learner:
+    def policy_state(self) -> PolicyTrainState:
         """The policy as it acts; it has no optimizer and cannot learn."""
-        return Learner(params=self.policy, optimizer=None, targets=self.targets)
+        return PolicyTrainState(params=self.policy, optimizer=None, targets=self.targets)
 
 
 @dataclasses.dataclass(frozen=True)
-class Restored:
+class Remainder:
+    """What a `TrainState` holds besides its `SavedModel`: what only going on with training needs.
+
+    Its fields' names are those of checkpoints, so that a run of an earlier version can go on.
+
+    Attributes:
+      optimizer: the state of the policy's optimizer.
+      player: the rollout's state.
+      replay, world_model_optimizer: None for agents that have none.
+      world_model_trained: the world model's parameters, where the saved ones are their moving average; else None.
+      world_model_measured: the moving averages of what is known of rewards, where they are measured; else None.
+    """
+
+    optimizer: Any
+    player: RolloutState
+    replay: ReplayState | None
+    world_model_optimizer: Any
+    world_model_trained: Any
+    world_model_measured: jax.Array | None
+
+    @classmethod
+    def of(cls, state: TrainState) -> Remainder:
+        """The part of `state` that is not saved as the model."""
+        model = state.world_model
+        return cls(
+            optimizer=state.policy.optimizer,
+            player=state.rollout,
+            replay=state.replay,
+            world_model_optimizer=None if model is None else model.optimizer,
+            world_model_trained=None if model is None or model.averaged is None else model.params,
+            world_model_measured=None if model is None else model.measured,
+        )
+
+    def stored(self) -> dict[str, Any]:
+        """As checkpoints hold it: by name."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    def with_model(self, saved: SavedModel) -> TrainState:
+        """The `TrainState` whose parts these two are."""
+        world_model, trained = None, self.world_model_trained
+        if saved.world_model is not None:
+            world_model = WorldModelTrainState(
+                params=saved.world_model if trained is None else trained,
+                optimizer=self.world_model_optimizer,
+                averaged=None if trained is None else saved.world_model,
+                measured=self.world_model_measured,
+            )
+        policy = dataclasses.replace(saved.policy_state, optimizer=self.optimizer)
+        return TrainState(policy, self.player, self.replay, saved.tokenizer, world_model)
+
+
+@dataclasses.dataclass(frozen=True)
+class RestoredRun:
     """A run's agent and its newest model, taken after `step` real steps."""
 
     agent: Agent
@@ -58,7 +113,7 @@ class Restored:
     step: int
 
 
-def restore(record: RunRecord, reporter: Reporter) -> Restored:
+def restore(record: RunRecord, reporter: Reporter) -> RestoredRun:
     """The newest model of a run.
 
     Args:
@@ -75,7 +130,7 @@ def restore(record: RunRecord, reporter: Reporter) -> Restored:
         raise no_checkpoint(record)
     for warning in restored.warnings:
         reporter.warning(warning)
-    return Restored(agent, restored.model, restored.step)
+    return RestoredRun(agent, restored.model, restored.step)
 
 
 def no_checkpoint(record: RunRecord) -> UserError:

@@ -322,10 +322,10 @@ def _select(option: str, words: str, known: Iterable[str]) -> list[str]:
     """The ids that these are or match. An id need not be known here: families have more tasks than are listed."""
     chosen: list[str] = []
     for word in words.split(","):
-        found = fnmatch.filter(known, word) if set("*?[") & set(word) else [word]
-        if not found:
+        matching = fnmatch.filter(known, word) if set("*?[") & set(word) else [word]
+        if not matching:
             raise UserError(f"{option}: nothing matches {word!r}; valid: {', '.join(sorted(known))}")
-        chosen += found
+        chosen += matching
     return list(dict.fromkeys(chosen))
 
 

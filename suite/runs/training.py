@@ -21,10 +21,9 @@ from suite.configuration.schema import Config
 from suite.records import checkpoint
 from suite.records.record import RunRecord, disk_full_is_an_error, run_folder
 from suite.runs.evaluation import episode_rows, record_evaluation
-from suite.runs.saved_model import SavedModel, agent_for
+from suite.runs.saved_model import Remainder, SavedModel, agent_for
 from suite.runtime.errors import RunError, UserError, host_errors
 from suite.runtime.reporting import Reporter
-from suite.world_model.training import WorldModelLearner
 
 PHASES = ("start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint")
 
@@ -70,7 +69,7 @@ class _Training:
         self.config, self.agent, self.record, self.reporter = config, agent, record, reporter
         self.checkpoints = record.folder / "checkpoints"
         self.iteration = self.steps = 0
-        self.found: dict[str, Any] = {}  # the present iteration's metrics
+        self.metrics: dict[str, Any] = {}  # of the present iteration
         self.rows: list[dict[str, Any]] = []  # and the episodes that ended in it
         self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
         self.recorded_seconds: dict[str, float] = {}  # of those, what timing.csv has
@@ -116,7 +115,8 @@ class _Training:
     def _restore(self) -> TrainState:
         key = start_key(self.config.seed)
         template = jax.eval_shape(self.agent.init, key)
-        restored = checkpoint.restore_latest(self.checkpoints, *_split(template))
+        remainder = Remainder.of(template).stored()
+        restored = checkpoint.restore_latest(self.checkpoints, SavedModel.of(template), remainder)
         if restored is None:
             self.record.rewind(0)
             return self.agent.init(key)
@@ -127,19 +127,19 @@ class _Training:
         self.recorded_seconds = dict(self.seconds)
         self.record.rewind(self.steps)
         self.reporter.message(f"resuming at step {self.steps:,}")
-        return _join(restored.model, restored.resume)
+        return Remainder(**restored.resume).with_model(restored.model)
 
     def _iterate(self, state: TrainState) -> TrainState:
         """One iteration of Algorithm 1, and what it leaves in the record."""
-        self.found, self.rows = {}, []
+        self.metrics, self.rows = {}, []
         key = iteration_key(self.config.seed, self.iteration)
         self.iteration += 1
         state, _ = iterate(self.agent, state, key, self.steps, self._call)
         self.record.append_episodes(self.rows)
         returns = [row["return"] for row in self.rows]
         mean_return = float(np.mean(returns)) if returns else None
-        summary = {"reward_per_step": self.found.pop("reward_per_step"), "episodes": len(returns)}
-        row = {"step": self.steps, **summary, "return": mean_return, **self.found}
+        summary = {"reward_per_step": self.metrics.pop("reward_per_step"), "episodes": len(returns)}
+        row = {"step": self.steps, **summary, "return": mean_return, **self.metrics}
         self.record.append_metrics(row, self.agent.metric_names)
         self._record_timing()
         self.reporter.update(self.steps, "", {} if mean_return is None else {"return": mean_return})
@@ -157,9 +157,9 @@ class _Training:
                 log = jax.device_get(log)
                 self.rows, taken = episode_rows(log, self.agent.spec, log.ended_TB, self.steps)
                 self.steps += taken
-                self.found["reward_per_step"] = float(trajectory.reward_TB.mean())
+                self.metrics["reward_per_step"] = float(trajectory.reward_TB.mean())
             else:
-                self.found |= self._check(phase, result[1])
+                self.metrics |= self._check(phase, result[1])
         return result
 
     def _record_timing(self) -> None:
@@ -182,13 +182,13 @@ class _Training:
 
     def _check(self, phase: str, metrics: dict[str, jax.Array]) -> dict[str, float]:
         """Metrics on the host, prefixed by their phase; stops the run where a loss or gradient is not finite."""
-        found = {f"{phase}/{name}": float(value) for name, value in jax.device_get(metrics).items()}
-        for name, value in found.items():
+        values = {f"{phase}/{name}": float(value) for name, value in jax.device_get(metrics).items()}
+        for name, value in values.items():
             if not np.isfinite(value):
                 kept = checkpoint.latest_step(self.checkpoints)
                 where = "no checkpoint was saved yet" if kept is None else f"the checkpoint at step {kept:,} is kept"
                 raise RunError(f"{name} became {value} in phase {phase} at step {self.steps:,}; {where}")
-        return found
+        return values
 
     def _evaluate(self, state: TrainState) -> None:
         """Plays whole episodes with the present policy, unless there are some of this step already."""
@@ -196,13 +196,13 @@ class _Training:
             return
         with self._phase("evaluate"):
             episodes = self.config.evaluation.episodes
-            record_evaluation(self.record, self.agent, state.learner.acting, self.steps, episodes)
+            record_evaluation(self.record, self.agent, state.policy.acting, self.steps, episodes)
 
     def _save(self, state: TrainState) -> None:
         with self._phase("checkpoint"):
             host = {"iteration": self.iteration, "steps": self.steps, "seconds": self.seconds}
-            model, resume = _split(state)
-            checkpoint.save(self.checkpoints, self.steps, model, resume, host, keep=self.config.checkpoint.keep)
+            model, remainder = SavedModel.of(state), Remainder.of(state).stored()
+            checkpoint.save(self.checkpoints, self.steps, model, remainder, host, keep=self.config.checkpoint.keep)
 
     def _finish(self, state: TrainState) -> None:
         """Saves the last checkpoint, plays the final evaluation, and closes the record."""
@@ -231,33 +231,6 @@ class _Training:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
-
-
-def _split(state: TrainState) -> tuple[SavedModel, dict[str, Any]]:
-    """A checkpoint's two items: what evaluation needs, and what only going on needs."""
-    world_model = state.world_model
-    resume = {"optimizer": state.learner.optimizer, "player": state.player, "replay": state.replay}
-    resume |= {"world_model_optimizer": None, "world_model_trained": None, "world_model_measured": None}
-    if world_model is not None:
-        resume["world_model_optimizer"] = world_model.optimizer
-        resume["world_model_measured"] = world_model.measured
-        if world_model.averaged is not None:
-            resume["world_model_trained"] = world_model.params
-    return SavedModel.of(state), resume
-
-
-def _join(model: SavedModel, resume: dict[str, Any]) -> TrainState:
-    """The inverse of `_split`."""
-    world_model, trained = None, resume["world_model_trained"]
-    if model.world_model is not None:
-        world_model = WorldModelLearner(
-            params=model.world_model if trained is None else trained,
-            optimizer=resume["world_model_optimizer"],
-            averaged=None if trained is None else model.world_model,
-            measured=resume["world_model_measured"],
-        )
-    learner = dataclasses.replace(model.learner, optimizer=resume["optimizer"])
-    return TrainState(learner, resume["player"], resume["replay"], model.tokenizer, world_model)
 
 
 def _result(record: RunRecord, status: str) -> Result:

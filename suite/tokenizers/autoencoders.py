@@ -72,7 +72,7 @@ class Up(nnx.Module):
         return join_patches(cells, (2 * rows, 2 * columns, channels), (2, 2)) + self.bias[...][None, None, None]
 
 
-class ResidualBlock(nnx.Module):
+class AutoencoderBlock(nnx.Module):
     """x, through a 1x1 convolution where channels change, plus two times [norm, ReLU, convolution]."""
 
     def __init__(self, inputs: int, outputs: int, rngs: nnx.Rngs):
@@ -102,7 +102,7 @@ class FrameEncoder(nnx.Module):
     def __init__(self, shape: tuple[int, ...], channels: Sequence[int], size: int, rngs: nnx.Rngs):
         self.first = Conv(shape[-1], channels[0], rngs)
         inputs = (channels[0], *channels[:-1])
-        self.blocks = nnx.List(ResidualBlock(i, o, rngs) for i, o in zip(inputs, channels, strict=True))
+        self.blocks = nnx.List(AutoencoderBlock(i, o, rngs) for i, o in zip(inputs, channels, strict=True))
         self.halved = downsampled(shape)
         self.downs = nnx.List(Down(channels[index], rngs) for index in self.halved)
         self.last = NormReLUConv(channels[-1], size, rngs)
@@ -124,7 +124,7 @@ class FrameDecoder(nnx.Module):
         self.shape = shape
         self.first = Conv(size, channels[-1], rngs)
         outputs = (channels[0], *channels[:-1])
-        self.blocks = nnx.List(ResidualBlock(i, o, rngs) for i, o in zip(channels, outputs, strict=True))
+        self.blocks = nnx.List(AutoencoderBlock(i, o, rngs) for i, o in zip(channels, outputs, strict=True))
         self.doubled = downsampled(shape)
         self.ups = nnx.List(Up(channels[index], rngs) for index in self.doubled)
         self.last = NormReLUConv(channels[0], shape[-1], rngs)

@@ -64,7 +64,7 @@ class Sequences:
 
 
 @struct.dataclass
-class WorldModelLearner:
+class WorldModelTrainState:
     """What training changes: the parameters (an `nnx.State`), the optimizer's state and perhaps moving averages.
 
     Those are of the parameters and, float32 [1 + R], of the loss of rewards on steps that the model had not learned
@@ -79,12 +79,12 @@ class WorldModelLearner:
     @classmethod
     def create(
         cls, config: WorldModelConfig, optimizer: optax.GradientTransformation, params: Any
-    ) -> WorldModelLearner:
+    ) -> WorldModelTrainState:
         """That of an untrained model."""
         return cls(params, optimizer.init(params), jax.tree.map(jnp.copy, params) if config.average else None)
 
-    def shown(self, contents_KP: jax.Array) -> WorldModelLearner:
-        """The same with models that know these `Tokenizer.contents`, which training leaves as they are."""
+    def with_contents(self, contents_KP: jax.Array) -> WorldModelTrainState:
+        """The same, with models that know these `Tokenizer.contents`, which training leaves as they are."""
 
         def show(params: Any) -> Any:
             def leaf(path: Any, array: jax.Array) -> jax.Array:
@@ -219,23 +219,23 @@ def update(
     optimizer: optax.GradientTransformation,
     graphdef: nnx.GraphDef,
     spec: TokenSpec,
-    learner: WorldModelLearner,
+    model_state: WorldModelTrainState,
     sequences: Sequences,
     key: jax.Array,
-) -> tuple[WorldModelLearner, dict[str, jax.Array]]:
+) -> tuple[WorldModelTrainState, dict[str, jax.Array]]:
     """One gradient step; the metrics are `losses`', `loss` and `gradient_norm` (before clipping)."""
 
     def loss(params: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
         return losses(nnx.merge(graphdef, params), sequences, config, spec, key)
 
-    (value, metrics), grads = jax.value_and_grad(loss, has_aux=True)(learner.params)
+    (value, metrics), grads = jax.value_and_grad(loss, has_aux=True)(model_state.params)
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):  # Optax mixes both
-        updates, state = optimizer.update(grads, learner.optimizer, learner.params)
+        updates, state = optimizer.update(grads, model_state.optimizer, model_state.params)
     metrics |= {"loss": value, "gradient_norm": optax.tree.norm(grads)}
-    params, averaged = optax.apply_updates(learner.params, updates), learner.averaged
+    params, averaged = optax.apply_updates(model_state.params, updates), model_state.averaged
     if averaged is not None:
         averaged = optax.incremental_update(params, averaged, 1 - config.average)
-    return learner.replace(params=params, optimizer=state, averaged=averaged), metrics  # type: ignore[attr-defined]
+    return model_state.replace(params=params, optimizer=state, averaged=averaged), metrics  # type: ignore[attr-defined]
 
 
 def reward_frequency(spec: TokenSpec, reward_N: jax.Array) -> jax.Array:

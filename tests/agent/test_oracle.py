@@ -28,8 +28,10 @@ def agent():
 def played(agent):
     """The agent's state, with 8 real steps of each environment in the replay buffer, and those steps."""
     state = agent.init(jax.random.key(0))
-    player, trajectory, _ = agent.collect(state.learner.acting, state.player, jax.random.key(1))
-    return dataclasses.replace(state, player=player, replay=agent.remember(state.replay, trajectory)), trajectory
+    rollout_state, trajectory, _ = agent.collect(state.policy.acting, state.rollout, jax.random.key(1))
+    return dataclasses.replace(
+        state, rollout=rollout_state, replay=agent.remember(state.replay, trajectory)
+    ), trajectory
 
 
 def test_replay_keeps_each_frames_own_state(agent, played):
@@ -44,7 +46,7 @@ def test_replay_keeps_each_frames_own_state(agent, played):
 def test_a_dream_is_the_game_from_replayed_states(agent, played):
     """Every imagined frame, reward and end follows from the state in which the dream began and from its actions."""
     state, _ = played
-    dream = jax.jit(lambda *x: agent.dream(x[0], None, None, *x[1:]))(state.learner, state.replay, jax.random.key(2))
+    dream = jax.jit(lambda *x: agent.dream(x[0], None, None, *x[1:]))(state.policy, state.replay, jax.random.key(2))
     cell_TB = np.asarray(dream.observation_TB)[:, :, ::5, ::5, 0].reshape(*dream.action_TB.shape, 4).argmax(-1)
     action_TB, reward_TB, end_TB = (np.asarray(x) for x in (dream.action_TB, dream.reward_TB, dream.terminated_TB))
     arrived_TB = np.clip(cell_TB + 2 * action_TB - 1, 0, 3)
@@ -61,7 +63,7 @@ def test_a_dream_in_the_game_ends_when_the_game_does(agent, played):
     replay = state.replay
     stored = dataclasses.replace(replay.experience.state, time=jnp.full_like(replay.experience.state.time, 5))
     late = replay.replace(experience=dataclasses.replace(replay.experience, state=stored))
-    dream = jax.jit(lambda *x: agent.dream(x[0], None, None, *x[1:]))(state.learner, late, jax.random.key(2))
+    dream = jax.jit(lambda *x: agent.dream(x[0], None, None, *x[1:]))(state.policy, late, jax.random.key(2))
     assert (dream.terminated_TB[0] | dream.truncated_TB[0]).all()
 
 

@@ -29,10 +29,10 @@ def setup(environment, seed=0):
     return policy, batched, play.start(policy, batched, jax.random.key(seed), M)
 
 
-def roll(environment, length=T, seed=0, player=None):
+def roll(environment, length=T, seed=0, rollout_state=None):
     policy, batched, fresh = setup(environment, seed)
     run = jax.jit(lambda p: play.rollout(jax.random.key(seed + 1), policy, TARGETS, batched, p, length))
-    return policy, *run(fresh if player is None else player)
+    return policy, *run(fresh if rollout_state is None else rollout_state)
 
 
 @pytest.fixture(scope="module")
@@ -91,39 +91,39 @@ def test_the_log_adds_up_whole_episodes(corridor):
 
 
 def test_a_second_rollout_goes_on_where_the_first_stopped():
-    policy, player, first, _ = roll(Corridor(), length=8)
-    _, player, second, _ = roll(Corridor(), length=8, player=player)
+    policy, rollout_state, first, _ = roll(Corridor(), length=8)
+    _, rollout_state, second, _ = roll(Corridor(), length=8, rollout_state=rollout_state)
     observation_TB = jnp.concatenate([first.observation_TB, second.observation_TB])
     first_TB = jnp.concatenate([first.first_TB, second.first_TB])
     output, hidden_BH = policy(observation_TB, first_TB, first.hidden_BH)
     chex.assert_trees_all_close(second.value_TB, output.value_TB[8:], atol=1e-5)
-    chex.assert_trees_all_close(player.hidden_BH, hidden_BH, atol=1e-5)
+    chex.assert_trees_all_close(rollout_state.hidden_BH, hidden_BH, atol=1e-5)
 
 
 def test_burn_in_with_unchanged_parameters_changes_nothing_and_follows_new_ones():
-    policy, player, _, _ = roll(Corridor())
-    same = play.refresh(policy, player, carried=True)
-    chex.assert_trees_all_close(same.hidden_BH, player.hidden_BH, atol=1e-5)
+    policy, rollout_state, _, _ = roll(Corridor())
+    same = play.refresh(policy, rollout_state, carried=True)
+    chex.assert_trees_all_close(same.hidden_BH, rollout_state.hidden_BH, atol=1e-5)
     other = setup(Corridor(), seed=9)[0]
-    fresh = play.refresh(other, player, carried=True)
-    assert not np.allclose(fresh.hidden_BH, player.hidden_BH, atol=1e-3)
+    fresh = play.refresh(other, rollout_state, carried=True)
+    assert not np.allclose(fresh.hidden_BH, rollout_state.hidden_BH, atol=1e-3)
 
 
 def test_burn_in_from_zero_sees_only_the_recent_frames():
-    policy, player, trajectory, _ = roll(Corridor(limit=100))
-    forgotten = play.refresh(policy, player, carried=False)
+    policy, rollout_state, trajectory, _ = roll(Corridor(limit=100))
+    forgotten = play.refresh(policy, rollout_state, carried=False)
     expected = policy.advance(
-        trajectory.observation_TB[-M:], trajectory.first_TB[-M:], jnp.zeros_like(player.hidden_BH)
+        trajectory.observation_TB[-M:], trajectory.first_TB[-M:], jnp.zeros_like(rollout_state.hidden_BH)
     )
     chex.assert_trees_all_close(forgotten.hidden_BH, expected, atol=1e-5)
     no_end_B = ~trajectory.first_TB[-M:].any(0)
     assert bool(no_end_B.any())
-    difference_B = jnp.abs(forgotten.hidden_BH - player.hidden_BH).max(-1)
+    difference_B = jnp.abs(forgotten.hidden_BH - rollout_state.hidden_BH).max(-1)
     assert (difference_B[no_end_B] > 1e-5).all()
 
 
 def test_events_of_chance_and_the_opponent_are_theirs():
-    policy, player, trajectory, _ = roll(Pennies())
+    policy, rollout_state, trajectory, _ = roll(Pennies())
     player_TB = jnp.arange(T)[:, None] % 3 + jnp.zeros((T, B), jnp.int32)
     chex.assert_trees_all_equal(trajectory.acting_TB, player_TB == 1 + jnp.arange(B)[None] % 2)
     chance = trajectory.action_TB[player_TB == 0]
@@ -134,15 +134,15 @@ def test_events_of_chance_and_the_opponent_are_theirs():
         trajectory.observation_TB, trajectory.first_TB, trajectory.hidden_BH, trajectory.acting_TB
     )
     chex.assert_trees_all_close(trajectory.value_TB, output.value_TB, atol=1e-5)
-    chex.assert_trees_all_close(player.hidden_BH, hidden_BH, atol=1e-5)
+    chex.assert_trees_all_close(rollout_state.hidden_BH, hidden_BH, atol=1e-5)
 
 
 def test_seeds_are_a_batch_axis():
     policy, batched, _ = setup(Corridor(limit=3))
 
     def whole(key):
-        player = play.start(policy, batched, key, M)
-        return play.rollout(key, policy, TARGETS, batched, player, 8)[1:]
+        rollout_state = play.start(policy, batched, key, M)
+        return play.rollout(key, policy, TARGETS, batched, rollout_state, 8)[1:]
 
     keys = jax.random.split(jax.random.key(3), 2)
     together = jax.jit(jax.vmap(whole))(keys)

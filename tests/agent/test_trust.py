@@ -58,9 +58,9 @@ def agent():
 
 def played(agent):
     """The state of a fresh agent, and the two trajectories that its buffer has room for."""
-    state, player, trajectories = agent.init(jax.random.key(0)), None, []
+    state, rollout_state, trajectories = agent.init(jax.random.key(0)), None, []
     for key in jax.random.split(jax.random.key(1), 2):
-        player, trajectory, _ = agent.collect(state.learner.acting, player or state.player, key)
+        rollout_state, trajectory, _ = agent.collect(state.policy.acting, rollout_state or state.rollout, key)
         trajectories.append(trajectory)
     return state, trajectories
 
@@ -96,14 +96,14 @@ def test_the_newest_steps_measure_a_model_that_has_not_learned_from_them(agent):
     tokenizer, _ = agent.update_tokenizer(state.tokenizer, replay, jax.random.key(3))
     contents_KP = agent.tokenizer.contents(tokenizer)
     assert np.asarray(contents_KP).any()
-    learner, expected = state.world_model, jnp.zeros(3)
+    model_state, expected = state.world_model, jnp.zeros(3)
     measure = jax.jit(agent._measure)
     for key in jax.random.split(jax.random.key(2), 2):
-        now = measure(learner.shown(contents_KP).dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
+        now = measure(model_state.with_contents(contents_KP).dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
         np.testing.assert_array_equal(now[1:], [0, 1])
         expected = expected + (now - expected) / 2
-        learner, metrics = agent.update_world_model(learner, tokenizer, replay, key)
-        np.testing.assert_allclose(learner.measured, expected, rtol=1e-5)
-        np.testing.assert_array_equal(learner.dreaming["contents"][...], contents_KP)
+        model_state, metrics = agent.update_world_model(model_state, tokenizer, replay, key)
+        np.testing.assert_allclose(model_state.measured, expected, rtol=1e-5)
+        np.testing.assert_array_equal(model_state.dreaming["contents"][...], contents_KP)
         assert metrics["reward_known"] == 0  # for all rewards that were measured are alike
     assert metrics["reward_loss"] < now[0]  # half of the steps that it learned from pay, and it had begun to say so

@@ -13,8 +13,8 @@ from tests.tiny import CORRIDOR
 
 def test_every_phase_is_measured_and_projected(monkeypatch):
     monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR))
-    monkeypatch.setattr(comparisons, "RACE_ENVS", 4)
-    monkeypatch.setattr(comparisons, "RACE_STEPS", 8)
+    monkeypatch.setattr(comparisons, "NUM_ENVS", 4)
+    monkeypatch.setattr(comparisons, "NUM_STEPS", 8)
     config = registry.resolve("corridor", "m5", "smoke")
     report = phases.bench(config, QuietReporter(), start_up=False)
     shown = {row["phase"]: row for row in report["phases of one iteration"]}
@@ -34,9 +34,9 @@ def test_every_phase_is_measured_and_projected(monkeypatch):
     assert all(row["ms"] > 0 for row in report["one imagined frame"])
 
 
-def test_hosted_engines_race_without_the_contestant_that_plays_past_the_end(monkeypatch):
-    monkeypatch.setattr(comparisons, "RACE_ENVS", 2)
-    monkeypatch.setattr(comparisons, "RACE_STEPS", 30)
+def test_hosted_engines_are_compared_without_the_variant_that_plays_past_the_end(monkeypatch):
+    monkeypatch.setattr(comparisons, "NUM_ENVS", 2)
+    monkeypatch.setattr(comparisons, "NUM_STEPS", 30)
     monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, CORRIDOR))
-    (row,) = comparisons.reset_race(registry.resolve("corridor", "m5", "smoke"), Walks())
+    (row,) = comparisons.compare_resets(registry.resolve("corridor", "m5", "smoke"), Walks())
     assert row["environment"] == "exact auto-reset" and row["steps/s"] > 0

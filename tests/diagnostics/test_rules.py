@@ -25,7 +25,7 @@ def test_a_model_that_knows_the_rules_and_one_that_knows_nothing(uniform):
     agent, state, _, model, _ = learned()
 
     def kept_by(params):
-        return rules_kept(agent, state.learner, params, state.tokenizer, jax.random.key(0), 200, uniform)
+        return rules_kept(agent, state.policy, params, state.tokenizer, jax.random.key(0), 200, uniform)
 
     kept = kept_by(model.params)
     assert kept["games"] == 200 and kept["events"] > 300

@@ -18,7 +18,7 @@ from suite.records.record import RunRecord, run_folder
 from suite.registry import resolve, task
 
 TASK = "minatar/breakout"
-SURROUNDINGS = {
+PROVENANCE = {
     "python": "3.11.7",
     "packages": {"jax": "0.10.2"},
     "git_commit": "0123456789abcdef0123456789abcdef01234567",
@@ -30,7 +30,7 @@ SURROUNDINGS = {
 def elsewhere(tmp_path, monkeypatch):
     """An empty folder, and code that is committed whatever the state of this checkout."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(record, "surroundings", lambda: SURROUNDINGS)
+    monkeypatch.setattr(record, "provenance", lambda: PROVENANCE)
 
 
 def write(
@@ -87,7 +87,7 @@ def test_rows_ranks_and_evidence(suite):
     assert (mfrl["value"], mfrl["iqm"]) == (5, 5) and mfrl["error"] == pytest.approx(math.sqrt(13 / 3), rel=1e-7)
     assert mfrl["iqm_low"] == 2 and mfrl["iqm_high"] == 9
     assert mfrl["minutes"] == 2 and mfrl["hardware"] == "2 CPU cores" and mfrl["environment"] == "gymnax"
-    assert mfrl["git_commit"] == SURROUNDINGS["git_commit"] and "jax==0.10.2" in mfrl["packages"]
+    assert mfrl["git_commit"] == PROVENANCE["git_commit"] and "jax==0.10.2" in mfrl["packages"]
     assert mfrl["evidence"] == "evidence/minatar/breakout/mfrl/small"
     assert changed["evidence"].startswith("evidence/minatar/breakout/m5/small-")
     kept = {path.name for path in Path("leaderboards", mfrl["evidence"], "seed_2").iterdir()}
@@ -212,7 +212,7 @@ def test_other_versions_of_a_game_are_ranked_apart(suite, monkeypatch, tmp_path)
     monkeypatch.setattr(record, "package_version", lambda package: "1.0.0")
     write("m5", returns=(1.0,))
     monkeypatch.undo()
-    monkeypatch.setattr(record, "surroundings", lambda: SURROUNDINGS)
+    monkeypatch.setattr(record, "provenance", lambda: PROVENANCE)
     monkeypatch.chdir(tmp_path)
     assert suite("publish", "runs")[0] == 0
     ours = board()[lambda table: table["measured_here"]]

@@ -55,19 +55,23 @@ def learn_cue(rnn_size: int, iterations: int = 60) -> float:
     optimizer = ppo.make_optimizer(config)
 
     def iteration(carry, key):
-        learner, player = carry
-        policy = nnx.merge(graphdef, learner.params)
-        player, trajectory, log = play.rollout(key, policy, learner.targets, environment, player, 4 * CUE_LENGTH)
-        learner, _ = ppo.update(
-            config, optimizer, graphdef, learner, trajectory, epochs=4, minibatches=2, entropy_coefficient=0.01
+        policy_state, rollout_state = carry
+        policy = nnx.merge(graphdef, policy_state.params)
+        rollout_state, trajectory, log = play.rollout(
+            key, policy, policy_state.targets, environment, rollout_state, 4 * CUE_LENGTH
         )
-        return (learner, player), log.return_TB.mean(where=log.ended_TB)
+        policy_state, _ = ppo.update(
+            config, optimizer, graphdef, policy_state, trajectory, epochs=4, minibatches=2, entropy_coefficient=0.01
+        )
+        return (policy_state, rollout_state), log.return_TB.mean(where=log.ended_TB)
 
     @jax.jit
     def train(params):
-        learner = ppo.Learner.create(config, optimizer, params)
-        player = play.start(nnx.merge(graphdef, params), environment, jax.random.key(1), burn_in=0)
-        return jax.lax.scan(iteration, (learner, player), jax.random.split(jax.random.key(2), iterations))[1]
+        policy_state = ppo.PolicyTrainState.create(config, optimizer, params)
+        rollout_state = play.start(nnx.merge(graphdef, params), environment, jax.random.key(1), burn_in=0)
+        return jax.lax.scan(iteration, (policy_state, rollout_state), jax.random.split(jax.random.key(2), iterations))[
+            1
+        ]
 
     return float(train(params)[-10:].mean())
 

@@ -131,7 +131,7 @@ def test_cnn_activation_is_configurable():
 
 
 def test_residual_block_is_the_identity_when_its_last_convolution_is_zero():
-    block = networks.ResidualBlock(4, TINY, jnp.float32, nnx.Rngs(0))
+    block = networks.PolicyBlock(4, TINY, jnp.float32, nnx.Rngs(0))
     x_NHWC = random(2, 5, 5, 4)
     assert not np.allclose(block(x_NHWC), x_NHWC)
     block.convs[-1].kernel[...] = jnp.zeros_like(block.convs[-1].kernel[...])

@@ -169,35 +169,35 @@ def test_targets_of_nothing_change_nothing():
 
 @functools.cache
 def setup(config: PPOConfig, seed: int = 0):
-    """graphdef, optimizer and a fresh learner on `SYMBOLS`."""
+    """graphdef, optimizer and a fresh policy_state on `SYMBOLS`."""
     network = nnx.jit(lambda: make_policy(TINY, SYMBOLS, ACTIONS, nnx.Rngs(seed)))()
     network.policy_head.kernel[...] = 30.0 * network.policy_head.kernel[...]  # something to disagree with
     graphdef, params = nnx.split(network)
     optimizer = ppo.make_optimizer(config)
-    return graphdef, optimizer, ppo.Learner.create(config, optimizer, params)
+    return graphdef, optimizer, ppo.PolicyTrainState.create(config, optimizer, params)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def as_played(graphdef, learner, t: ppo.Trajectory) -> ppo.Trajectory:
-    """`t` with the log-probabilities and values that the learner's policy gives it."""
-    output, _ = nnx.merge(graphdef, learner.params)(t.observation_TB, t.first_TB, t.hidden_BH, t.acting_TB)
+def as_played(graphdef, policy_state, t: ppo.Trajectory) -> ppo.Trajectory:
+    """`t` with the log-probabilities and values that the policy_state's policy gives it."""
+    output, _ = nnx.merge(graphdef, policy_state.params)(t.observation_TB, t.first_TB, t.hidden_BH, t.acting_TB)
     logits_TBA = mask_logits(output.logits_TBA, t.legal_TBA)
     return t.replace(
         log_probability_TB=log_probability(logits_TBA, t.action_TB),
-        value_TB=learner.targets.denormalize(output.value_TB),
+        value_TB=policy_state.targets.denormalize(output.value_TB),
     )
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2), static_argnames=("epochs", "minibatches", "entropy_coefficient"))
-def run(config, graphdef, optimizer, learner, t, *, epochs=1, minibatches=1, entropy_coefficient=0.01):
+def run(config, graphdef, optimizer, policy_state, t, *, epochs=1, minibatches=1, entropy_coefficient=0.01):
     plan = {"epochs": epochs, "minibatches": minibatches, "entropy_coefficient": entropy_coefficient}
-    return ppo.update(config, optimizer, graphdef, learner, t, **plan)
+    return ppo.update(config, optimizer, graphdef, policy_state, t, **plan)
 
 
 def test_metrics_are_named():
     config = PPOConfig()
-    graphdef, optimizer, learner = setup(config)
-    _, metrics = run(config, graphdef, optimizer, learner, random_trajectory(0), epochs=2, minibatches=2)
+    graphdef, optimizer, policy_state = setup(config)
+    _, metrics = run(config, graphdef, optimizer, policy_state, random_trajectory(0), epochs=2, minibatches=2)
     assert sorted(metrics) == sorted(ppo.METRICS)
     assert all(value.shape == () and value.dtype == jnp.float32 for value in metrics.values())
 
@@ -205,20 +205,20 @@ def test_metrics_are_named():
 @pytest.mark.parametrize("turns", [False, True])
 def test_first_minibatch_has_ratio_one(turns):
     config = PPOConfig()
-    graphdef, optimizer, learner = setup(config)
-    t = as_played(graphdef, learner, random_trajectory(0, turns=turns))
-    _, metrics = run(config, graphdef, optimizer, learner, t)
+    graphdef, optimizer, policy_state = setup(config)
+    t = as_played(graphdef, policy_state, random_trajectory(0, turns=turns))
+    _, metrics = run(config, graphdef, optimizer, policy_state, t)
     assert metrics["clip_fraction"] == 0.0
     assert metrics["approx_kl"] == pytest.approx(0.0, abs=1e-6)
     assert metrics["policy_loss"] == pytest.approx(0.0, abs=1e-5)  # minus the mean of standardized advantages
     fast = PPOConfig(learning_rate=0.1)
-    _, later = run(fast, graphdef, ppo.make_optimizer(fast), learner, t, epochs=4)
+    _, later = run(fast, graphdef, ppo.make_optimizer(fast), policy_state, t, epochs=4)
     assert later["approx_kl"] > 1e-3 and later["clip_fraction"] > 0.0
 
 
-def reference_loss(config: PPOConfig, graphdef, learner, t: ppo.Trajectory, entropy_coefficient: float) -> dict:
+def reference_loss(config: PPOConfig, graphdef, policy_state, t: ppo.Trajectory, entropy_coefficient: float) -> dict:
     """The losses of one minibatch that is the whole batch, in NumPy."""
-    output, _ = nnx.merge(graphdef, learner.params)(t.observation_TB, t.first_TB, t.hidden_BH, t.acting_TB)
+    output, _ = nnx.merge(graphdef, policy_state.params)(t.observation_TB, t.first_TB, t.hidden_BH, t.acting_TB)
     advantage, mask = reference_advantages(t, config.discount, config.gae_lambda)
     legal = np.ones((*mask.shape, ACTIONS), bool) if t.legal_TBA is None else np.asarray(t.legal_TBA)
     logits = np.where(legal, np.asarray(output.logits_TBA), -np.inf)
@@ -244,10 +244,10 @@ def reference_loss(config: PPOConfig, graphdef, learner, t: ppo.Trajectory, entr
 def test_losses_against_numpy(turns):
     """With old log-probabilities that differ from the new, so that clipping is at work."""
     config = PPOConfig()
-    graphdef, optimizer, learner = setup(config)
+    graphdef, optimizer, policy_state = setup(config)
     t = random_trajectory(3, turns=turns)
-    _, metrics = run(config, graphdef, optimizer, learner, t)
-    expected = reference_loss(config, graphdef, learner, t, 0.01)
+    _, metrics = run(config, graphdef, optimizer, policy_state, t)
+    expected = reference_loss(config, graphdef, policy_state, t, 0.01)
     assert 0 < expected["clip_fraction"] < 1
     for name, value in expected.items():
         assert metrics[name] == pytest.approx(value, rel=1e-3, abs=1e-4), name
@@ -260,7 +260,7 @@ def changed(before: nnx.State, after: nnx.State) -> float:
 def test_events_of_others_teach_nothing():
     """Their actions (even ones that we do not have), probabilities and values do not matter; the memory waits."""
     config = PPOConfig()
-    graphdef, optimizer, learner = setup(config)
+    graphdef, optimizer, policy_state = setup(config)
     t = random_trajectory(5, turns=True)
     theirs = ~t.acting_TB
     other = t.replace(
@@ -270,34 +270,34 @@ def test_events_of_others_teach_nothing():
         turn_TB=t.turn_TB.replace(legal_A=t.legal_TBA & t.acting_TB[..., None]),
         observation_TB=jnp.where(theirs[..., None], jnp.uint8(0), t.observation_TB),
     )
-    results = [run(config, graphdef, optimizer, learner, x, epochs=2, minibatches=2) for x in (t, other)]
+    results = [run(config, graphdef, optimizer, policy_state, x, epochs=2, minibatches=2) for x in (t, other)]
     (a, metrics), (b, other_metrics) = results
     assert all(jnp.isfinite(value) for value in metrics.values())
     assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(b.params))
-    assert changed(a.params, b.params) < 1e-5 < changed(a.params, learner.params)
+    assert changed(a.params, b.params) < 1e-5 < changed(a.params, policy_state.params)
     np.testing.assert_allclose(metrics["value_loss"], other_metrics["value_loss"], rtol=1e-4)
 
 
 def test_a_batch_without_our_decisions_is_finite():
     config = PPOConfig()
-    graphdef, optimizer, learner = setup(config)
+    graphdef, optimizer, policy_state = setup(config)
     t = random_trajectory(5, turns=True)
     nobody = t.replace(turn_TB=t.turn_TB.replace(seat=jnp.zeros_like(t.turn_TB.seat)))
-    after, metrics = run(config, graphdef, optimizer, learner, nobody)
+    after, metrics = run(config, graphdef, optimizer, policy_state, nobody)
     assert all(jnp.isfinite(value) for value in metrics.values())
-    assert changed(after.params, learner.params) == 0.0
+    assert changed(after.params, policy_state.params) == 0.0
 
 
 def test_minibatches_are_contiguous_groups_of_environments():
     """Fidelity note 9. Two minibatches are two updates of halves, in order, given the advantages of the whole."""
     config = PPOConfig(gae_lambda=0.0, discount=0.0)
-    graphdef, optimizer, learner = setup(config)
+    graphdef, optimizer, policy_state = setup(config)
     t = random_trajectory(1)
     no = jnp.zeros_like(t.terminated_TB)
     # Advantages are rewards here. Both halves have those of the whole, so that standardizing them apart is the same.
     reward_TB = jnp.tile(t.reward_TB[:, :2], (1, 2))
     t = t.replace(reward_TB=reward_TB, value_TB=jnp.zeros_like(reward_TB), terminated_TB=no, truncated_TB=no)
-    together, _ = run(config, graphdef, optimizer, learner, t, epochs=2, minibatches=2)
+    together, _ = run(config, graphdef, optimizer, policy_state, t, epochs=2, minibatches=2)
 
     def part(start: int, stop: int) -> ppo.Trajectory:
         by_environment = {"hidden_BH": t.hidden_BH[start:stop], "last_value_B": t.last_value_B[start:stop]}
@@ -308,7 +308,7 @@ def test_minibatches_are_contiguous_groups_of_environments():
         }
         return ppo.Trajectory(**steps, **by_environment)
 
-    in_order, swapped = learner, learner
+    in_order, swapped = policy_state, policy_state
     for _ in range(2):
         for start in (0, 2):
             in_order, _ = run(config, graphdef, optimizer, in_order, part(start, start + 2))
@@ -320,17 +320,17 @@ def test_minibatches_are_contiguous_groups_of_environments():
 
 def test_minibatches_must_divide_the_environments():
     config = PPOConfig()
-    graphdef, optimizer, learner = setup(config)
+    graphdef, optimizer, policy_state = setup(config)
     with pytest.raises(ValueError, match="3 minibatches do not divide 4 environments"):
-        run(config, graphdef, optimizer, learner, random_trajectory(0), minibatches=3)
+        run(config, graphdef, optimizer, policy_state, random_trajectory(0), minibatches=3)
 
 
 def test_gradients_are_clipped_by_their_global_norm():
     """Adam's first moment after one update is a tenth of the gradient that reached it."""
     for limit, clipped in ((1e-3, True), (1e6, False)):
         config = PPOConfig(max_grad_norm=limit)
-        graphdef, optimizer, learner = setup(config)
-        after, metrics = run(config, graphdef, optimizer, learner, random_trajectory(0))
+        graphdef, optimizer, policy_state = setup(config)
+        after, metrics = run(config, graphdef, optimizer, policy_state, random_trajectory(0))
         moment = optax.tree_utils.tree_get(after.optimizer, "mu")
         expected = limit if clipped else metrics["gradient_norm"]
         assert metrics["gradient_norm"] > 1e-3
@@ -341,15 +341,15 @@ def test_gradients_are_clipped_by_their_global_norm():
 def test_learning_rate_falls_linearly_to_zero(anneal):
     """Fidelity note 11. Adam on a constant gradient moves by the rate itself."""
     config = PPOConfig()
-    graphdef, optimizer, learner = setup(config)
+    graphdef, optimizer, policy_state = setup(config)
     t = random_trajectory(0)
 
     def moved(share: float) -> float:
         """How far one minibatch moves the parameters when `share` of the budget is left, none of it afterwards."""
         remaining = (jnp.float32(share), jnp.float32(0)) if anneal else None
         plan = {"epochs": 1, "minibatches": 1, "entropy_coefficient": 0.0, "remaining": remaining}
-        after, _ = ppo.update(config, optimizer, graphdef, learner, t, **plan)
-        return changed(after.params, learner.params)
+        after, _ = ppo.update(config, optimizer, graphdef, policy_state, t, **plan)
+        return changed(after.params, policy_state.params)
 
     full = moved(1.0)
     shares = [0.75, 0.25, 0.0] if anneal else [1.0]
@@ -359,13 +359,13 @@ def test_learning_rate_falls_linearly_to_zero(anneal):
 def test_learning_rate_falls_between_minibatches():
     """Two minibatches of equal halves from a share of 1 to 0: rates 1 and 0.5, so the second adds half of its own."""
     config = PPOConfig()
-    graphdef, optimizer, learner = setup(config)
+    graphdef, optimizer, policy_state = setup(config)
     t = random_trajectory(0)
 
-    def after(last: float, minibatches: int) -> ppo.Learner:
+    def after(last: float, minibatches: int) -> ppo.PolicyTrainState:
         remaining = (jnp.float32(1), jnp.float32(last))
         plan = {"epochs": 1, "minibatches": minibatches, "entropy_coefficient": 0.0, "remaining": remaining}
-        return ppo.update(config, optimizer, graphdef, learner, t, **plan)[0]
+        return ppo.update(config, optimizer, graphdef, policy_state, t, **plan)[0]
 
     steady, falling = after(1.0, 2), after(0.0, 2)
     first_only = after(-1.0, 2)  # rates 1 and 0
@@ -374,9 +374,9 @@ def test_learning_rate_falls_between_minibatches():
 
 
 def test_acting_needs_no_optimizer():
-    _, _, learner = setup(PPOConfig())
-    acting = learner.acting
-    assert acting.optimizer is None and acting.params is learner.params and acting.targets is learner.targets
+    _, _, policy_state = setup(PPOConfig())
+    acting = policy_state.acting
+    assert acting.optimizer is None and acting.params is policy_state.params and acting.targets is policy_state.targets
 
 
 def test_several_seeds_learn_side_by_side():

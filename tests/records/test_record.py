@@ -13,7 +13,7 @@ import pytest
 from suite.records import tables
 from suite.records.event_files import EventFile
 from suite.records.record import RunRecord, disk_full_is_an_error, require_writable, run_folder
-from suite.records.tables import Table, cell, write_whole
+from suite.records.tables import CsvTable, cell, write_whole
 from suite.registry import resolve
 from suite.runtime.errors import RunError, UserError
 from tests.tiny import CORRIDOR_SPEC
@@ -116,10 +116,10 @@ def test_a_row_cut_off_by_a_kill(tmp_path):
 def test_appending_after_a_cut_off_row_or_header(tmp_path):
     path = tmp_path / "table.csv"
     path.write_bytes(b"step,va")
-    Table(path, ["step", "value"]).append([{"step": 1, "value": 2}])
+    CsvTable(path, ["step", "value"]).append([{"step": 1, "value": 2}])
     with path.open("ab") as file:
         file.write(b"2,")
-    Table(path, ["step", "value"]).append([{"step": 3}])
+    CsvTable(path, ["step", "value"]).append([{"step": 3}])
     assert path.read_bytes() == b"step,value\n1,2\n3,\n"
 
 

@@ -51,11 +51,11 @@ def test_learning_a_timer_by_muon():
             tokens_BTL[:, LIMIT:], none.astype(jnp.int32), none, none.astype(bool), age_BTL=age_BTL
         )
 
-    def update(learner, key):
-        return training.update(config, optimizer, graph, SPEC, learner, batch(key), key)
+    def update(model_state, key):
+        return training.update(config, optimizer, graph, SPEC, model_state, batch(key), key)
 
-    learner = training.WorldModelLearner(params, optimizer.init(params))
-    _, metrics = jax.jit(lambda *x: jax.lax.scan(update, *x))(learner, jax.random.split(jax.random.key(0), 200))
+    model_state = training.WorldModelTrainState(params, optimizer.init(params))
+    _, metrics = jax.jit(lambda *x: jax.lax.scan(update, *x))(model_state, jax.random.split(jax.random.key(0), 200))
     assert metrics["token_accuracy"][-20:].mean() > 0.99  # a model of single frames gets 0.75
     assert metrics["changed_token_accuracy"][-20:].mean() > 0.99
 

@@ -97,13 +97,13 @@ def test_training_learns_to_read_contents_and_leaves_them_as_they_are():
     config = small_config(patch_contents=True, local_embedding=3, average=0.5, learning_rate=1e-2)
     graph, params = nnx.split(model_of())
     optimizer = training.make_optimizer(config)
-    learner = training.WorldModelLearner.create(config, optimizer, params).shown(CONTENTS)
+    model_state = training.WorldModelTrainState.create(config, optimizer, params).with_contents(CONTENTS)
     update = jax.jit(
-        lambda learner: training.update(config, optimizer, graph, SEEN, learner, SEQUENCES, jax.random.key(0))
+        lambda model_state: training.update(config, optimizer, graph, SEEN, model_state, SEQUENCES, jax.random.key(0))
     )
-    learner, metrics = update(learner)
+    model_state, metrics = update(model_state)
     assert np.isfinite(metrics["loss"])
-    for found in (learner.params, learner.dreaming):
+    for found in (model_state.params, model_state.dreaming):
         model = nnx.merge(graph, found)
         np.testing.assert_array_equal(model.contents[...], CONTENTS)
         for reading in (model.content_embedding, model.content_local, model.content_logits):

@@ -149,11 +149,11 @@ def test_learning_to_shift():
         tokens = jnp.concatenate([first, moved], axis=1).reshape(16, 2, PLACES)
         return training.Sequences(tokens, none.astype(jnp.int32), none, none.astype(bool))
 
-    def update(learner, key):
-        return training.update(config, optimizer, graph, spec, learner, batch(key), key)
+    def update(model_state, key):
+        return training.update(config, optimizer, graph, spec, model_state, batch(key), key)
 
-    learner = training.WorldModelLearner(params, optimizer.init(params))
-    _, metrics = jax.jit(lambda *x: jax.lax.scan(update, *x))(learner, jax.random.split(jax.random.key(0), 300))
+    model_state = training.WorldModelTrainState(params, optimizer.init(params))
+    _, metrics = jax.jit(lambda *x: jax.lax.scan(update, *x))(model_state, jax.random.split(jax.random.key(0), 300))
     assert metrics["token_accuracy"][-20:].mean() > 0.98  # 50 codes were never learned one by one in so many updates
     assert metrics["copied_share"][-20:].mean() == pytest.approx(0.75, abs=0.05)
 

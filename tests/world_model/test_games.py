@@ -40,9 +40,9 @@ def played():
         imagination__horizon=4,
     )
     state = agent.init(jax.random.key(0))
-    player, replay = state.player, state.replay
+    player, replay = state.rollout, state.replay
     for i in range(PLAYS):
-        player, trajectory, _ = agent.collect(state.learner.acting, player, jax.random.key(i))
+        player, trajectory, _ = agent.collect(state.policy.acting, player, jax.random.key(i))
         replay = agent.remember(replay, trajectory)
     return agent, state.replace(player=player), replay, trajectory
 
@@ -76,7 +76,7 @@ def test_the_dream_plays_by_the_rules():
     """Chance, player 1 and player 2 take turns; each seat's reward is its own, and follows from coin and guess."""
     agent, state, replay, model, _ = learned()
     dreamed = jax.jit(lambda key: agent.dream(
-        state.learner, nnx.merge(agent.world_model_graph, model.params), state.tokenizer, replay, key
+        state.policy, nnx.merge(agent.world_model_graph, model.params), state.tokenizer, replay, key
     ))(jax.random.key(7))  # fmt: skip
     turn = dreamed.turn_TB
     player = np.asarray(turn.player)
@@ -116,15 +116,15 @@ def test_what_the_opponent_sees_never_reaches_our_policy():
         )
     )
     steps = jnp.array([0.0, 32.0])
-    fresh = jax.tree.map(jnp.copy, (state.learner, state.learner))
+    fresh = jax.tree.map(jnp.copy, (state.policy, state.policy))
     learners = [agent.learn(mine, t, steps)[0] for mine, t in zip(fresh, (trajectory, other), strict=True)]
     chex.assert_trees_all_equal(*learners)
 
-    player = jax.tree.map(jnp.copy, state.player)
+    player = jax.tree.map(jnp.copy, state.rollout)
     shown = player.time_step
     hidden = shown.replace(turn=shown.turn.replace(opponent_observation=3 - shown.turn.opponent_observation))
     results = [
-        agent.collect(state.learner.acting, jax.tree.map(jnp.copy, player.replace(time_step=x)), jax.random.key(3))[1]
+        agent.collect(state.policy.acting, jax.tree.map(jnp.copy, player.replace(time_step=x)), jax.random.key(3))[1]
         for x in (shown, hidden)
     ]
     chex.assert_trees_all_equal(*(t.action_TB for t in results))

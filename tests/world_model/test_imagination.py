@@ -87,7 +87,7 @@ def learned() -> Learned:
     graph, params = nnx.split(small_model(std=0.15, dropout=0.0))
     optimizer = training.make_optimizer(config)
 
-    def update(learner, key):
+    def update(model_state, key):
         starts = jax.random.randint(key, (32,), 0, 200 - HORIZON)
 
         def window(start, index):
@@ -99,12 +99,14 @@ def learned() -> Learned:
                 cut(tokens, HORIZON + 1), cut(action, HORIZON), cut(shown.reward, HORIZON), terminated
             )
 
-        return training.update(config, optimizer, graph, SPEC, learner, jax.vmap(window)(starts, jnp.arange(32)), key)
+        return training.update(
+            config, optimizer, graph, SPEC, model_state, jax.vmap(window)(starts, jnp.arange(32)), key
+        )
 
-    learner = training.WorldModelLearner(params, optimizer.init(params))
+    model_state = training.WorldModelTrainState(params, optimizer.init(params))
     keys = jax.random.split(jax.random.key(1), 800)
-    learner, _ = jax.jit(lambda learner, keys: jax.lax.scan(update, learner, keys))(learner, keys)
-    model = nnx.merge(graph, learner.params)
+    model_state, _ = jax.jit(lambda model_state, keys: jax.lax.scan(update, model_state, keys))(model_state, keys)
+    model = nnx.merge(graph, model_state.params)
 
     frames, action, shown = (jax.tree.map(lambda x: x[-HORIZON - 1 :], x) for x in real_play(seed=5, steps=200))
     tokens_BTL = tokenizer.encode(codes, frames).swapaxes(0, 1)

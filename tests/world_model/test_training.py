@@ -12,7 +12,7 @@ from flax import nnx
 
 from suite.world_model.heads import Head
 from suite.world_model.imagination import next_frame
-from suite.world_model.training import METRICS, WorldModelLearner, cross_entropy, losses, make_optimizer, update
+from suite.world_model.training import METRICS, WorldModelTrainState, cross_entropy, losses, make_optimizer, update
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import GRID, SPEC, random_sequences, small_config, small_model
 
@@ -100,9 +100,9 @@ def test_an_update_is_clipped_adam_and_returns_the_named_metrics():
     config = small_config(max_grad_norm=1e-3, dropout=0.0, average=0.75)
     graph, params = nnx.split(small_model(std=0.2, dropout=0.0))
     optimizer = make_optimizer(config)
-    learner = WorldModelLearner.create(config, optimizer, params)
+    model_state = WorldModelTrainState.create(config, optimizer, params)
     step = jax.jit(functools.partial(update, config, optimizer, graph, SPEC))
-    after, metrics = step(learner, SEQUENCES, jax.random.key(0))
+    after, metrics = step(model_state, SEQUENCES, jax.random.key(0))
     assert set(metrics) == set(METRICS) and len(METRICS) == len(set(METRICS))
     assert all(value.shape == () for value in metrics.values())
 
@@ -126,8 +126,8 @@ def test_an_update_is_clipped_adam_and_returns_the_named_metrics():
 
 def test_without_an_average_dreams_use_the_newest_parameters():
     _, params = nnx.split(small_model())
-    learner = WorldModelLearner.create(small_config(), make_optimizer(small_config()), params)
-    assert learner.averaged is None and learner.dreaming is learner.params
+    model_state = WorldModelTrainState.create(small_config(), make_optimizer(small_config()), params)
+    assert model_state.averaged is None and model_state.dreaming is model_state.params
 
 
 def test_rewards_and_ends_are_read_off_every_place():

@@ -104,7 +104,7 @@ def test_what_cannot_happen_changes_nothing():
         ("leduc", [2], [2, -1, 6]),  # a card that is dealt
         ("leduc", [2, 4], [0, -1, 3]),  # no fold before a bet
     ]:
-        hosted_engine = openspiel_host.Engine(engine(name), games.game(name).spec)
+        hosted_engine = openspiel_host.OpenSpielEngine(engine(name), games.game(name).spec)
         for seed in (0, 1):  # which does not matter
             shown = hosted_engine.reset(seed)
             for event in events:
@@ -118,7 +118,7 @@ def test_what_cannot_happen_changes_nothing():
 def test_an_unexpected_observation_is_one_line():
     spec = hosted("leduc").spec
     low = dataclasses.replace(spec, observation=dataclasses.replace(spec.observation, high=1))
-    leduc = openspiel_host.Engine(engine("leduc"), low)
+    leduc = openspiel_host.OpenSpielEngine(engine("leduc"), low)
     leduc.reset(0)
     leduc.step(0)
     leduc.step(1)
@@ -126,7 +126,7 @@ def test_an_unexpected_observation_is_one_line():
     with pytest.raises(RunError) as error:
         leduc.step(2)
     assert str(error.value) == line.format(3, 1)
-    oware = openspiel_host.Engine(engine("oware"), dataclasses.replace(spec, num_actions=6))
+    oware = openspiel_host.OpenSpielEngine(engine("oware"), dataclasses.replace(spec, num_actions=6))
     with pytest.raises(RunError) as error:
         oware.reset(0)
     assert str(error.value) == line.format("0.0833333", spec.observation.high)
