@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from suite import registry
 from suite.configuration.overrides import apply_changes
 from suite.configuration.schema import Config
+
+if TYPE_CHECKING:
+    from suite.interface.environment import EnvironmentSpec
 
 Part = Callable[[Config], dict[str, Any]]
 
 LOCAL_EMBEDDING = 16  # numbers that the tokens around each one are embedded in
 MIN_P = 0.2
-TWO_PLAYERS = ("openspiel/", "pettingzoo/")
 # At the paper's 0.75, grass and water at night are one code: distances shrink with the light. A codebook of twice the
 # size holds what 0.5 tells apart.
 NIGHT_THRESHOLD = 0.5
@@ -32,15 +35,15 @@ PARTS: dict[str, Part] = {
     "correspondence": lambda config: {"world_model.correspondence": True},
     "grid": lambda config: {"world_model.positions": "grid"},
     "local": lambda config: {"world_model.local_embedding": LOCAL_EMBEDDING},
-    "contents": lambda config: {"world_model.patch_contents": True} if config.task.startswith("minatar/") else {},
+    "contents": lambda config: {"world_model.patch_contents": True} if _shows_objects(config) else {},
     "action": lambda config: {"world_model.action_in_tokens": True},
-    "min_p": lambda config: {"imagination.min_p": MIN_P} if config.task.startswith(TWO_PLAYERS) else {},
+    "min_p": lambda config: {"imagination.min_p": MIN_P} if _task(config).two_player else {},
     "places": lambda config: {"world_model.place_heads": True},
     "ages": lambda config: {"world_model.ages": _ages(config)},
     "muon": lambda config: {"world_model.optimizer": "muon", "world_model.learning_rate": MUON_LEARNING_RATE},
-    "games": lambda config: _patient(config) if config.task.startswith(TWO_PLAYERS) else {},
+    "games": lambda config: _patient(config) if _task(config).two_player else {},
     "average": lambda config: {"world_model.average": AVERAGE},
-    "codes": lambda config: _finer_codes(config) if config.task.startswith("craftax") else {},
+    "codes": lambda config: _finer_codes(config) if _task(config).light_changes else {},
     "trust": lambda config: {"imagination.trust": _trust(config), "imagination.trust_window": TRUST_WINDOW},
 }
 
@@ -70,6 +73,18 @@ def oracle(config: Config) -> Config:
     return apply_changes(config, {"world_model.enabled": False, "imagination.world": "game"})
 
 
+def _task(config: Config) -> EnvironmentSpec:
+    """What the task is: m6 asks this, and not which task it is, so that it plays other distributions' tasks too."""
+    spec: EnvironmentSpec = registry.task(config.task).spec()
+    return spec
+
+
+def _shows_objects(config: Config) -> bool:
+    """Whether a place of a frame says of each kind of object whether one is there, as in MinAtar."""
+    observation = _task(config).observation
+    return observation.kind == "grid" and observation.high == 1
+
+
 def _ages(config: Config) -> int:
     """`AGES`, or what the first iteration's steps leave room for before a training sequence."""
     return min(AGES, config.environment.rollout_length - config.world_model.sequence_length - 1)
@@ -85,7 +100,7 @@ def _patient(config: Config) -> dict[str, Any]:
 
 
 def _trust(config: Config) -> float:
-    return GAMES_TRUST if config.task.startswith(TWO_PLAYERS) else TRUST
+    return GAMES_TRUST if _task(config).two_player else TRUST
 
 
 def _with_parts(config: Config, parts: Mapping[str, Part]) -> Config:

@@ -11,6 +11,7 @@ import pandas as pd
 from leaderboards.results import Entry, entries_of
 from leaderboards.scoring import main_score
 from leaderboards.statistics import mean_and_standard_error
+from suite.interface.scores import ScoreName
 from suite.records.record import RunRecord
 from suite.runtime.errors import UserError, did_you_mean
 
@@ -62,7 +63,7 @@ def compare(records: Sequence[RunRecord], parts: int = 5, score: str | None = No
 def _compare(entries: list[Entry], parts: int, score: str | None) -> Comparison:
     config = entries[0].config
     _require_one_run_a_seed(entries)
-    names = [name for name in entries[0].scores if "/" not in name]
+    names = [name for name in entries[0].scores if not ScoreName(name).is_of_part]
     curve_of = score or main_score(names)
     if curve_of not in names:
         raise UserError(f"{config.task} has no score {curve_of!r}; {did_you_mean(curve_of, names)}")
@@ -97,19 +98,15 @@ def tables(comparison: Comparison) -> list[pd.DataFrame]:
     scores, curve = [], []
     parts = len(next(iter(comparison.curve.values())))
     for agent, by_name in comparison.scores.items():
-        named = {_label(name): _text(value) for name, value in by_name.items()}
+        named = {ScoreName(name).heading: _text(value) for name, value in by_name.items()}
         minutes = {"minutes": f"{comparison.minutes[agent][0]:.1f}"}
         scores.append({"agent": agent, "seeds": str(comparison.seeds[agent]), **named, **minutes})
         ends = [f"to {round((i + 1) * comparison.steps / parts):,}" for i in range(parts)]
         curve.append(
-            {f"{_label(comparison.curve_of)}, steps": agent}
+            {f"{ScoreName(comparison.curve_of).heading}, steps": agent}
             | dict(zip(ends, map(_text, comparison.curve[agent]), strict=True))
         )
     return [pd.DataFrame(scores), pd.DataFrame(curve)]
-
-
-def _label(name: str) -> str:
-    return name.replace("_percent", " %").replace("_", " ")
 
 
 def _text(value: Estimate) -> str:

@@ -13,16 +13,7 @@ from leaderboards.qualification import overrides
 from leaderboards.results import Entry
 from suite import registry
 
-# The games that a family's mean is over: the paper's.
-GAMES = {
-    "craftax_classic": ("craftax_classic",),
-    "craftax_full": ("craftax_full",),
-    "minatar": ("minatar/asterix", "minatar/breakout", "minatar/freeway", "minatar/space_invaders"),
-    "openspiel": ("openspiel/tic_tac_toe", "openspiel/leduc", "openspiel/bargaining"),
-}
-# MinAtar's returns have no common unit: 1 is what the model-free agent earns in a game (the paper's Section 4.6).
-METRICS = {"minatar": OF_FAMILY, "openspiel": "normalized_return"}
-BASELINE = "mfrl"
+BASELINE = "mfrl"  # where a family's returns have no common unit, 1 is what this agent earns (the paper's Section 4.6)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +22,7 @@ class FamilyScores:
 
     Attributes:
       family: its name.
-      entries: the agent's, in the order of `GAMES`.
+      entries: the agent's, in the order of the family's `games`.
       metric: what is scored: comparable between games.
       values: of each game, the seeds' scores [S].
     """
@@ -50,29 +41,30 @@ class FamilyScores:
 def families(entries: Sequence[Entry]) -> list[list[FamilyScores]]:
     """Agents that may be compared with each other: one list for each family, preset, budget and version of the games.
 
-    MinAtar's are left out where the baseline has not played all of them.
+    Those whose unit is the baseline's return are left out where it has not played all of the games.
     """
     groups: dict[tuple[Any, ...], dict[str, dict[str, Entry]]] = {}
     for entry in entries:
         config, rules = entry.config, entry.records[0].fields.protocol.model_dump()
         family = registry.task(config.task).family
-        if config.task in GAMES.get(family, ()) and not overrides(config):
+        if config.task in registry.family(family).games and not overrides(config):
             key = (family, config.preset, *(rules[name] for name in sorted(rules) if name != "task"))
             groups.setdefault(key, {}).setdefault(config.agent, {})[config.task] = entry
     comparable = []
     for (family, *_), agents in groups.items():
+        games, relative = registry.family(family).games, not registry.family(family).metric
         whole = {
-            agent: tuple(played[game] for game in GAMES[family])
+            agent: tuple(played[game] for game in games)
             for agent, played in agents.items()
-            if played.keys() == set(GAMES[family])
+            if played.keys() == set(games)
         }
-        if family != "minatar" or BASELINE in whole:
+        if not relative or BASELINE in whole:
             comparable.append([_scores(family, own, whole.get(BASELINE, ())) for own in whole.values()])
     return [group for group in comparable if group]
 
 
 def _scores(family: str, own: tuple[Entry, ...], baseline: tuple[Entry, ...]) -> FamilyScores:
-    metric = METRICS.get(family, "reward_percent")
+    metric = registry.family(family).metric or OF_FAMILY
     if metric == OF_FAMILY:
         pairs = zip(own, baseline, strict=True)
         values = [entry.scores["return"] / unit.scores["return"].mean() for entry, unit in pairs]

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from leaderboards.scoring import LABELS
 from suite import registry
 from suite.runtime.errors import UserError, did_you_mean
 
@@ -23,7 +24,6 @@ COLUMNS = (
     *("environment", "environment_version", "hardware", "minutes", "parameters_millions", "source", "note"),
     "measured_here",
 )
-METRICS = ("reward_percent", "score_percent", "return", "normalized_return")  # of `leaderboards.scoring`
 OF_FAMILY = "return_normalized_to_mfrl"  # a mean over games, MinAtar's: its task is their family
 NUMBERS, COUNTS = ("value", "error", "minutes", "parameters_millions"), ("seeds", "steps")
 REQUIRED = ("method", "value", "environment", "source")
@@ -38,7 +38,7 @@ def published(path: Path = PATH) -> pd.DataFrame:
     """
     tasks, agents = registry.tasks(), registry.agents()
     words: dict[str, Collection[str]] = {
-        "metric": (*METRICS, OF_FAMILY),
+        "metric": (*LABELS, OF_FAMILY),
         "agent": {"", *agents},
         "error_kind": ("", "standard error", "standard deviation"),
         "observation": ("pixels", "symbolic"),

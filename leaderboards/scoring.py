@@ -12,14 +12,28 @@ import numpy as np
 import pandas as pd
 
 from leaderboards.best_response import REFERENCE, normalized
+from suite.interface.scores import ScoreName
 
 if TYPE_CHECKING:
     from suite.configuration.schema import Config
     from suite.interface.environment import EnvironmentSpec
 
 
+# What stands above scores on pages.
+LABELS = {
+    "reward_percent": "Reward, % of the maximum",
+    "reward_percent_with_health": "Reward with health, %",
+    "score_percent": "Crafter score, %",
+    "return": "Return",
+    "normalized_return": "Normalized return (1: best response)",
+}
 # What Craftax calls its achievements by what they pay.
 TIERS = {1.0: "basic", 3.0: "intermediate", 5.0: "advanced", 8.0: "very_advanced"}
+SEATS = (1, 2)
+# Scores of a part of the achievements or of one seat, which tables of many agents leave to the CSV files.
+DETAILS = frozenset(
+    {*(f"success_percent_{tier}" for tier in TIERS.values()), *(f"return_seat_{seat}" for seat in SEATS)}
+)
 
 
 def craftax(
@@ -55,7 +69,7 @@ def craftax(
         "score_percent": crafter_score(list(success.values())),
         "episodes": len(episodes),
         "final_episodes": len(final),
-        **{f"success_percent/{name}": percent for name, percent in success.items()},
+        **{ScoreName.of_part("success_percent", name): percent for name, percent in success.items()},
         **(
             {f"success_percent_{name}": float(np.mean(rates)) for name, rates in tiers.items()}
             if len(tiers) > 1
@@ -89,8 +103,9 @@ def games(
     """
     episodes, final = _final(episodes, config, ["step", "return", "seat"])
     raw_return = final["raw_return" if "raw_return" in final else "return"]
-    returns = [float(raw_return[final["seat"] == seat].mean()) for seat in (1, 2)]
-    scores = {"return_seat_1": returns[0], "return_seat_2": returns[1], "return": sum(returns) / 2}
+    returns = [float(raw_return[final["seat"] == seat].mean()) for seat in SEATS]
+    scores = {f"return_seat_{seat}": value for seat, value in zip(SEATS, returns, strict=True)}
+    scores["return"] = sum(returns) / 2
     if spec.id in REFERENCE:
         reference = REFERENCE[spec.id]
         ours = map(normalized, returns, reference.random, reference.best_response)

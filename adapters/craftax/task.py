@@ -65,6 +65,7 @@ def _spec(id: str, pixels: tuple[int, int, int], tile: int, actions: int, reward
         achievement_rewards=tuple(rewards.values()),
         statistics=(("achievements", (len(rewards),)), ("achievement_return", ()), ("health_return", ())),
         package="craftax",
+        light_changes=True,
     )
 
 

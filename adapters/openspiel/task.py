@@ -41,7 +41,7 @@ _SCHEMA = 1  # of the files in the cache folder, and of what is too large for ta
 
 
 def _specification(
-    name: str, symbols: int, high: int, actions: int, outcomes: int, rewards: tuple[float, ...]
+    name: str, symbols: int, high: int, actions: int, outcomes: int, rewards: tuple[float, ...], fully_observed: bool
 ) -> EnvironmentSpec:
     return EnvironmentSpec(
         id=f"openspiel/{name}",
@@ -52,13 +52,16 @@ def _specification(
         package="open_spiel",
         two_player=True,
         chance_outcomes=outcomes,
+        fully_observed=fully_observed,
     )
 
 
 _SPECS = {
-    "tic_tac_toe": _specification("tic_tac_toe", 27, 1, 9, 0, SIGNS),
-    "leduc": _specification("leduc", 16, 13, 3, 6, SIGNS),  # pays -13..13, learned from the sign: fidelity note 32
-    "bargaining": _specification("bargaining", 93, 1, 121, 1002, tuple(map(float, range(11)))),
+    "tic_tac_toe": _specification("tic_tac_toe", 27, 1, 9, 0, SIGNS, True),
+    "leduc": _specification(
+        "leduc", 16, 13, 3, 6, SIGNS, False
+    ),  # pays -13..13, learned from the sign: fidelity note 32
+    "bargaining": _specification("bargaining", 93, 1, 121, 1002, tuple(map(float, range(11))), False),
 }
 
 
@@ -95,13 +98,6 @@ def make(name: str, progress: Progress | None = None) -> Environment:
     tables = _walked(name, progress)
     spec = _SPECS.get(name) or _specified(name, tables)
     return host.make(_engine(name), spec) if tables is None else TableGame(spec, tables)
-
-
-def fully_observed(name: str) -> bool:
-    """Whether both players see all there is, as on a board; arguments and errors as for `spec`."""
-    import pyspiel
-
-    return _engine(_canonical(name)).get_type().information == pyspiel.GameType.Information.PERFECT_INFORMATION
 
 
 def walked(name: str, progress: Progress | None = None) -> Tables:
@@ -285,6 +281,7 @@ def _measure(name: str, tables: Tables) -> EnvironmentSpec:
         actions=tables.next_DA.shape[-1],
         outcomes=tables.chance_KC.shape[-1],
         rewards=levels if len(levels) <= MAX_REWARD_CLASSES else SIGNS,
+        fully_observed=_fully_observed(_engine(name)),
     )
 
 
@@ -292,11 +289,18 @@ def _measure(name: str, tables: Tables) -> EnvironmentSpec:
 def _measure_by_play(name: str) -> EnvironmentSpec:
     game = _engine(name)
     symbols = int(np.prod(game.observation_tensor_shape()))
-    known = _specification(name, symbols, 1, game.num_distinct_actions(), game.max_chance_outcomes(), SIGNS)
+    actions, outcomes = game.num_distinct_actions(), game.max_chance_outcomes()
+    known = _specification(name, symbols, 1, actions, outcomes, SIGNS, _fully_observed(game))
     try:
         return host.measured(game, known)
     except game_tables.NotCategoricalError:
         raise _not_categorical(name) from None
+
+
+def _fully_observed(game: Any) -> bool:
+    import pyspiel
+
+    return game.get_type().information == pyspiel.GameType.Information.PERFECT_INFORMATION
 
 
 def _not_categorical(name: str) -> UserError:

@@ -64,8 +64,6 @@ MINATAR_SMALL: dict[str, Any] = {
 # meets one (two of three seeds ended at 1). This is the paper's rate.
 FREEWAY_SMALL: dict[str, Any] = {"ppo.learning_rate": 4.5e-4}
 
-MINATAR_SMALL_OF = {"minatar/freeway": FREEWAY_SMALL}
-
 
 def minatar_paper(config: Config) -> Config:
     """Tables "MFRL changes for MinAtar" and "MBRL changes for MinAtar", the same for all games."""
@@ -74,7 +72,12 @@ def minatar_paper(config: Config) -> Config:
 
 def minatar_small(config: Config) -> Config:
     """A tenth of the paper's budget, with a network and numbers of updates for two CPU cores."""
-    return apply_changes(config, MINATAR_PAPER | MINATAR_SMALL | MINATAR_SMALL_OF.get(config.task, {}))
+    return apply_changes(config, MINATAR_PAPER | MINATAR_SMALL)
+
+
+def freeway_small(config: Config) -> Config:
+    """`minatar_small` with Freeway's learning rate."""
+    return apply_changes(minatar_small(config), FREEWAY_SMALL)
 
 
 def minatar_smoke(config: Config) -> Config:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from suite import registry
 from suite.configuration.overrides import apply_changes
 from suite.configuration.schema import Config
 
@@ -19,9 +20,6 @@ OPENSPIEL_PAPER: dict[str, Any] = {
     "replay.capacity": 128_000,
     "checkpoint.every_steps": 10_000,
 }
-
-# Games in which both players see everything need no memory. Of these three it is known without the engine.
-FULLY_OBSERVED = {"openspiel/tic_tac_toe": True, "openspiel/leduc": False, "openspiel/bargaining": False}
 
 OPENSPIEL_SMALL: dict[str, Any] = {
     "protocol.final_fraction": 0.2,
@@ -91,10 +89,12 @@ def openspiel_paper(config: Config) -> Config:
 
 def openspiel_small(config: Config) -> Config:
     """The paper's budget, with a network and numbers of updates for two CPU cores."""
-    changes = OPENSPIEL_PAPER | OPENSPIEL_SMALL
-    if config.task == "openspiel/bargaining":
-        changes |= BARGAINING_SMALL
-    return _without_needless_memory(apply_changes(config, changes))
+    return _without_needless_memory(apply_changes(config, OPENSPIEL_PAPER | OPENSPIEL_SMALL))
+
+
+def bargaining_small(config: Config) -> Config:
+    """`openspiel_small` with a shallower model of shorter sequences."""
+    return apply_changes(openspiel_small(config), BARGAINING_SMALL)
 
 
 def openspiel_smoke(config: Config) -> Config:
@@ -103,9 +103,6 @@ def openspiel_smoke(config: Config) -> Config:
 
 
 def _without_needless_memory(config: Config) -> Config:
-    observed = FULLY_OBSERVED.get(config.task)
-    if observed is None:
-        from adapters.openspiel.task import fully_observed
-
-        observed = fully_observed(config.task.partition("/")[2])
+    """Where both players see everything there is nothing to remember."""
+    observed = registry.task(config.task).spec().fully_observed
     return apply_changes(config, {"policy.rnn_size": 0}) if observed else config

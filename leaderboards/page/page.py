@@ -14,35 +14,23 @@ import markupsafe
 import pandas as pd
 
 from leaderboards.boards import IMPROVEMENT, OVERALL, as_csv, sees, tables_digest
-from leaderboards.families import GAMES, families
+from leaderboards.families import families
 from leaderboards.page import plots
 from leaderboards.publish import PAGE
 from leaderboards.published import OF_FAMILY
 from leaderboards.qualification import overrides
 from leaderboards.results import Entry
-from leaderboards.scoring import main_score
+from leaderboards.scoring import DETAILS, LABELS, main_score
 from suite import registry
+from suite.interface.scores import ScoreName
 from suite.records.record import require_writable
 from suite.records.tables import write_whole
 
 HERE = Path(__file__).parent
 BARS = 4  # agents beside each other in a bar chart, at most
 PROFILE_RUNS = 10  # of an agent: the profile of fewer is a stair
-TITLES = {
-    "craftax_classic": "Craftax-classic",
-    "craftax_full": "Craftax (full)",
-    "minatar": "MinAtar",
-    "openspiel": "OpenSpiel",
-    "overall": "Families of games",
-}
-LABELS = {
-    "reward_percent": "Reward, % of the maximum",
-    "reward_percent_with_health": "Reward with health, %",
-    "score_percent": "Crafter score, %",
-    "normalized_return": "Normalized return (1: best response)",
-    OF_FAMILY: "Return, mfrl = 1",
-    IMPROVEMENT: "P(better than mfrl)",
-}
+OVERALL_TITLE = "Families of games"
+ABOVE = LABELS | {OF_FAMILY: "Return, mfrl = 1", IMPROVEMENT: "P(better than mfrl)"}  # what stands above a score
 OVERALL_SUMMARY = (
     "Each game's scores on one scale (MinAtar: the mean return of mfrl under the same preset is 1; OpenSpiel: 0 is a "
     "uniform player and 1 the best response), then the mean over games, which weigh alike. Minutes are those of one "
@@ -135,7 +123,7 @@ def _section(name: str, table: pd.DataFrame, entries: Sequence[Entry], everythin
     id = name.removesuffix(".csv")
     overall = name == OVERALL
     task = "" if overall else str(table["task"].iloc[0])
-    title = TITLES.get(id, task)
+    title = OVERALL_TITLE if overall else registry.task(task).title
     own = entries if overall else [entry for entry in entries if entry.config.task == task]
     parts = list(table.groupby("task", sort=False)) if overall else [("", table)]
     metrics = [] if overall else _shown(table["metric"])
@@ -144,7 +132,7 @@ def _section(name: str, table: pd.DataFrame, entries: Sequence[Entry], everythin
         "title": title,
         "summary": OVERALL_SUMMARY if overall else registry.task(task).summary,
         "caption": f"{title}: headings sort; {name} has more columns.",
-        "columns": _columns(["Score", LABELS[IMPROVEMENT]] if overall else list(map(_label, metrics))),
+        "columns": _columns(["Score", ABOVE[IMPROVEMENT]] if overall else list(map(_label, metrics))),
         "groups": [
             {"title": _heading(str(family), part), "rows": list(_rows(part, metrics or _shown(part["metric"], pad=2)))}
             for family, part in parts
@@ -160,7 +148,7 @@ def _shown(metrics: pd.Series, pad: int = 0) -> list[str]:
     """Scores with a column of their own, at least `pad`: each achievement's and each seat's stand in the CSV alone."""
     names = list(dict.fromkeys(metrics))
     names.sort(key=lambda name: name == IMPROVEMENT)
-    names = [name for name in names if "/" not in name and not name.startswith(("success_percent", "return_seat"))]
+    names = [name for name in names if not ScoreName(name).is_of_part and name not in DETAILS]
     return names + [""] * (pad - len(names))
 
 
@@ -169,11 +157,11 @@ def _heading(family: str, part: pd.DataFrame) -> str:
     if not family:
         return ""
     label = _label(_shown(part["metric"])[0])
-    return f"{TITLES.get(family, family)}: {label[0].lower()}{label[1:]}"
+    return f"{registry.family(family).title}: {label[0].lower()}{label[1:]}"
 
 
 def _label(metric: str) -> str:
-    return LABELS.get(metric, metric.replace("_percent", " %").replace("_", " ").capitalize())
+    return ABOVE.get(metric, ScoreName(metric).heading.capitalize())
 
 
 def _columns(scores: Sequence[str]) -> list[Column]:
@@ -268,13 +256,13 @@ def _stories(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str
             games[task] = told
     for (family, preset), games in games_of.items():
         if games:
-            order = [game for game in (*GAMES.get(family, ()), *games) if game in games]
+            order = [game for game in (*registry.family(family).games, *games) if game in games]
             panels = [_panel(games[game], table, game if len(games) > 1 else "") for game in dict.fromkeys(order)]
             first = panels[0].entries[0]
             yield _figure(
                 plots.learning_curves(panels),
-                f"{TITLES.get(family, family)}, preset {preset}: {panels[0].label}, of training episodes by when they "
-                "ended; mean over seeds, shaded its 95 % bootstrap interval. mfrl learns from real play alone, m5 and "
+                f"{registry.family(family).title}, preset {preset}: {panels[0].label}, of training episodes by when "
+                "they ended; mean over seeds, shaded its 95 % bootstrap interval. mfrl learns from real play alone, m5 and "
                 "m6 also from a learned world model, the oracle from the true game.",
                 first,
             )

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from suite.commands.printing import format_value, make_reporter, print_json, print_table
+from suite.interface.scores import ScoreName
 from suite.runtime.errors import UserError
 
 SUMMARY = "how good world models are: rollouts beside reality; of games, whether they keep the rules"
@@ -36,7 +37,7 @@ def _inspect_games(args: argparse.Namespace) -> int:
     for name, plays in kept.items():
         print(name)
         columns = [[format_value(kept[row]) for row in kept] for kept in plays.values()]
-        rows = [row.replace("_percent", " %").replace("_", " ") for row in next(iter(plays.values()))]
+        rows = [ScoreName(row).heading for row in next(iter(plays.values()))]
         print_table([["played by", *plays], *zip(rows, *columns, strict=True)])
     if args.json:
         print_json(kept)
@@ -51,10 +52,7 @@ def _inspect_rollouts(args: argparse.Namespace) -> int:
     reporter.stop()
     runs = result["runs"]
     names = list(dict.fromkeys(name for row in runs.values() for name in row))
-    rows = [
-        [name.replace("_percent", " %").replace("_", " "), *(format_value(row.get(name, "")) for row in runs.values())]
-        for name in names
-    ]
+    rows = [[ScoreName(name).heading, *(format_value(row.get(name, "")) for row in runs.values())] for name in names]
     print_table([["mean over rollout steps", *runs], *rows])
     print(f"tables, curves and filmstrips in {result['folder']}")
     if args.json:

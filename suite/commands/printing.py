@@ -9,6 +9,8 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from suite.interface.scores import ScoreName
+
 if TYPE_CHECKING:
     from suite.runtime.reporting import Reporter
 
@@ -32,13 +34,13 @@ def print_scores(scores: Mapping[str, Any]) -> None:
     """One line each, but for the parts of a score ("success_percent/..."); nan is a mean over no episodes."""
     reason = "no episode ended in the part that counts" if scores.get("episodes") else "no episode ended yet"
     for name, value in scores.items():
-        if "/" not in name:
+        if not ScoreName(name).is_of_part:
             print(score_line(name, value) + (f", {reason}" if value != value else ""))
 
 
 def score_line(name: str, value: float, error: float | None = None) -> str:
     """`("reward_percent", 12.34, 0.56)` as "reward 12.34 % +- 0.56 %"."""
-    label, unit = name.replace("_percent", "").replace("_", " "), " %" if "_percent" in name else ""
+    label, unit = ScoreName(name).words, ScoreName(name).unit
     if math.isnan(value):
         return f"{label} n/a"
     deviation = "" if error is None else f" +- {format_value(error)}{unit}"

@@ -53,6 +53,8 @@ class EnvironmentSpec:
       package: the package whose rules these are; its version is part of the protocol.
       two_player: whether time steps carry a `Turn`, and `reset` takes our seat.
       chance_outcomes: C, how many outcomes chance has in a two-player game; 0: there is no chance.
+      fully_observed: whether what is seen is all there is to know, as on a board; False: not, or it is not known.
+      light_changes: whether the same thing is drawn in more than one light, as by day and by night.
     """
 
     id: str
@@ -65,6 +67,8 @@ class EnvironmentSpec:
     package: str = ""
     two_player: bool = False
     chance_outcomes: int = 0
+    fully_observed: bool = False
+    light_changes: bool = False
 
     @property
     def max_return(self) -> float | None:

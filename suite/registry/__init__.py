@@ -13,11 +13,18 @@ from typing import Any, Literal, TypeVar
 
 from suite.configuration.overrides import apply_changes, parse_overrides
 from suite.configuration.schema import Config
-from suite.registry.catalog import AGENTS, FAMILIES, PRESETS, TASKS
-from suite.registry.entries import DEFAULT_AGENT, AgentEntry, Lazy, Made, PresetEntry, TaskEntry
+from suite.registry.catalog import AGENTS, FAMILIES, OPEN_FAMILIES, PRESETS, TASKS
+from suite.registry.entries import DEFAULT_AGENT, AgentEntry, FamilyEntry, Lazy, Made, PresetEntry, TaskEntry
 from suite.runtime.errors import UserError, did_you_mean
 
-__all__ = ["AgentEntry", "Lazy", "Made", "PresetEntry", "TaskEntry"]  # for other distributions, in one place
+__all__ = [
+    "AgentEntry",
+    "FamilyEntry",
+    "Lazy",
+    "Made",
+    "PresetEntry",
+    "TaskEntry",
+]  # for other distributions, in one place
 
 Source = Literal["default", "preset", "agent", "user"]
 Transform = Callable[[Config], Config]
@@ -27,6 +34,11 @@ Entry = TypeVar("Entry", TaskEntry, AgentEntry)
 def tasks() -> dict[str, TaskEntry]:
     """Every task by id, those of other distributions included."""
     return _with_plugins(TASKS, "suite.tasks", TaskEntry)
+
+
+def family(id: str) -> FamilyEntry:
+    """The family of this id; one of another distribution's tasks has no title and no mean over games."""
+    return next((entry for entry in FAMILIES if entry.id == id), FamilyEntry(id, id))
 
 
 def agents() -> dict[str, AgentEntry]:
@@ -140,8 +152,8 @@ def _find(kind: str, id: str, entries: Mapping[str, Any]) -> Any:
 def _find_task(id: str) -> TaskEntry:
     family, _, name = id.partition("/")
     known = tasks()
-    if id not in known and name and family in FAMILIES:
-        entry = FAMILIES[family](name)
+    if id not in known and name and family in OPEN_FAMILIES:
+        entry = OPEN_FAMILIES[family](name)
         entry.spec()  # which says what is wrong with a name that it does not know
         return entry
     return _find("task", id, known)

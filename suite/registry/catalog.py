@@ -1,13 +1,38 @@
-"""The tasks, agents and presets of this distribution. Importing this imports neither JAX nor any game."""
+"""The families, tasks, agents and presets of this distribution. Importing this imports neither JAX nor any game.
+
+A task is registered here and nowhere else: its rules (an adapter), its scores, the sizes it is run with, its title and
+its family. Everything else that knows tasks asks the registry.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
-from suite.registry.entries import AgentEntry, Lazy, Made, PresetEntry, TaskEntry
+from suite.registry.entries import AgentEntry, FamilyEntry, Lazy, Made, PresetEntry, TaskEntry
+
+FAMILIES = (
+    FamilyEntry("craftax_classic", "Craftax-classic", ("craftax_classic",), "reward_percent"),
+    FamilyEntry("craftax_full", "Craftax (full)", ("craftax_full",), "reward_percent"),
+    FamilyEntry(
+        "minatar", "MinAtar", ("minatar/asterix", "minatar/breakout", "minatar/freeway", "minatar/space_invaders")
+    ),
+    FamilyEntry(
+        "openspiel",
+        "OpenSpiel",
+        ("openspiel/tic_tac_toe", "openspiel/leduc", "openspiel/bargaining"),
+        "normalized_return",
+    ),
+    FamilyEntry("gymnasium", "Gymnasium"),
+    FamilyEntry("pettingzoo", "PettingZoo"),
+)
 
 
-def _game(name: str, summary: str = "", cost: str = "") -> TaskEntry:
+def _presets(module: str, **functions: str) -> Mapping[str, Lazy]:
+    """Functions of a module of `baselines.presets`, by the name of the preset that each of them makes."""
+    return {name: Lazy(f"baselines.presets.{module}:{function}") for name, function in functions.items()}
+
+
+def _game(name: str, summary: str = "", cost: str = "", small: str = "openspiel_small") -> TaskEntry:
     return TaskEntry(
         id=f"openspiel/{name}",
         family="openspiel",
@@ -15,16 +40,17 @@ def _game(name: str, summary: str = "", cost: str = "") -> TaskEntry:
         spec=Made("adapters.openspiel.task:spec", (name,)),
         make=Lazy("adapters.openspiel.task:make", (name,)),
         scores=Lazy("leaderboards.scoring:games"),
-        presets={
-            "paper": Lazy("baselines.presets.openspiel:openspiel_paper"),
-            "small": Lazy("baselines.presets.openspiel:openspiel_small"),
-            "smoke": Lazy("baselines.presets.openspiel:openspiel_smoke"),
-        },
+        presets=_presets("openspiel", paper="openspiel_paper", small=small, smoke="openspiel_smoke"),
         cost=cost,
     )
 
 
-def _minatar(name: str, summary: str, cost: str = "small on one CPU core: m5 4 min, mfrl 1, 1.0 GiB") -> TaskEntry:
+def _minatar(
+    name: str,
+    summary: str,
+    cost: str = "small on one CPU core: m5 4 min, mfrl 1, 1.0 GiB",
+    small: str = "minatar_small",
+) -> TaskEntry:
     return TaskEntry(
         id=f"minatar/{name}",
         family="minatar",
@@ -32,11 +58,7 @@ def _minatar(name: str, summary: str, cost: str = "small on one CPU core: m5 4 m
         spec=Made("adapters.minatar:spec", (name,)),
         make=Lazy("adapters.minatar:make", (name,)),
         scores=Lazy("leaderboards.scoring:returns"),
-        presets={
-            "paper": Lazy("baselines.presets.minatar:minatar_paper"),
-            "small": Lazy("baselines.presets.minatar:minatar_small"),
-            "smoke": Lazy("baselines.presets.minatar:minatar_smoke"),
-        },
+        presets=_presets("minatar", paper="minatar_paper", small=small, smoke="minatar_smoke"),
         cost=cost,
     )
 
@@ -49,16 +71,12 @@ def _foreign(family: str, name: str, scores: str) -> TaskEntry:
         spec=Made(f"adapters.{family}.task:spec", (name,)),
         make=Lazy(f"adapters.{family}.task:make", (name,)),
         scores=Lazy(f"leaderboards.scoring:{scores}"),
-        presets={
-            "small": Lazy("baselines.presets.foreign:foreign_small"),
-            "smoke": Lazy("baselines.presets.foreign:foreign_smoke"),
-        },
-        cost="",
+        presets=_presets("foreign", small="foreign_small", smoke="foreign_smoke"),
     )
 
 
 # Families with more tasks than are listed: any game of the library by its id.
-FAMILIES: dict[str, Callable[[str], TaskEntry]] = {
+OPEN_FAMILIES: dict[str, Callable[[str], TaskEntry]] = {
     "openspiel": _game,
     "gymnasium": lambda name: _foreign("gymnasium", name, "returns"),
     "pettingzoo": lambda name: _foreign("pettingzoo", name, "games"),
@@ -79,10 +97,11 @@ TASKS = (
         "bargaining",
         "bargaining, uniform opponent, both seats: 93 symbols, 121 actions, 1002 chance outcomes",
         "small on two CPU cores: m5 4 min, mfrl 0.3, 1.6 GiB",
+        small="bargaining_small",
     ),
     _minatar("asterix", "MinAtar's Asterix: gold and enemies; 10x10x4, 5 actions"),
     _minatar("breakout", "MinAtar's Breakout; 10x10x4, 3 actions"),
-    _minatar("freeway", "MinAtar's Freeway: cross between cars; 10x10x7, 3 actions"),
+    _minatar("freeway", "MinAtar's Freeway: cross between cars; 10x10x7, 3 actions", small="freeway_small"),
     _minatar(
         "seaquest",
         "MinAtar's Seaquest, not among the paper's; 10x10x10, 6 actions",
@@ -92,15 +111,12 @@ TASKS = (
     TaskEntry(
         id="craftax_classic",
         family="craftax_classic",
+        title="Craftax-classic",
         summary="Craftax-classic from 63x63 pixels: 17 actions, 22 achievements",
         spec=Lazy("adapters.craftax.task:CLASSIC_SPEC"),
         make=Lazy("adapters.craftax.task:make_classic"),
         scores=Lazy("leaderboards.scoring:craftax"),
-        presets={
-            "paper": Lazy("baselines.presets.craftax:paper"),
-            "small": Lazy("baselines.presets.craftax:craftax_classic_small"),
-            "smoke": Lazy("baselines.presets.craftax:craftax_classic_smoke"),
-        },
+        presets=_presets("craftax", paper="paper", small="craftax_classic_small", smoke="craftax_classic_smoke"),
         own_auto_reset=Lazy("adapters.craftax.task:classic_built_in_auto_reset"),
         symbols=Lazy("adapters.craftax.symbols:classic_symbols"),
         symbol_values=17,
@@ -109,15 +125,12 @@ TASKS = (
     TaskEntry(
         id="craftax_full",
         family="craftax_full",
+        title="Craftax (full)",
         summary="Craftax (full) from 130x110 pixels: 43 actions, 67 achievements worth 226",
         spec=Lazy("adapters.craftax.task:FULL_SPEC"),
         make=Lazy("adapters.craftax.task:make_full"),
         scores=Lazy("leaderboards.scoring:craftax"),
-        presets={
-            "paper": Lazy("baselines.presets.craftax:craftax_full_paper"),
-            "small": Lazy("baselines.presets.craftax:craftax_full_small"),
-            "smoke": Lazy("baselines.presets.craftax:craftax_full_smoke"),
-        },
+        presets=_presets("craftax", paper="craftax_full_paper", small="craftax_full_small", smoke="craftax_full_smoke"),
         own_auto_reset=Lazy("adapters.craftax.task:full_built_in_auto_reset"),
         cost="compiles for 1 min at first; small on one CPU core: m5 10 min, mfrl 5, 3.5 GiB; paper: an accelerator",
         paper_agent="m5_slow",

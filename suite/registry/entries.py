@@ -34,12 +34,30 @@ class Made(Lazy):
 
 
 @dataclasses.dataclass(frozen=True)
+class FamilyEntry:
+    """What tasks have in common whose results are shown together.
+
+    Attributes:
+      id: such as "minatar".
+      title: as pages write it.
+      games: ids of the tasks that an agent's mean over the family is over, the paper's; none: there is no such mean.
+      metric: the score of those tasks that can be averaged; "": none can, and each game's return is divided by what the
+        model-free baseline earns in it.
+    """
+
+    id: str
+    title: str
+    games: tuple[str, ...] = ()
+    metric: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
 class TaskEntry:
     """A task: where its parts are, without importing them.
 
     Attributes:
       id: `family` or `family/name`.
-      family: what its tasks share: rules, scoring, presets.
+      family: the id of its `FamilyEntry`, or, of another distribution's task, any word.
       summary: one line.
       spec: an `EnvironmentSpec`.
       make: a function that builds the environment; its `progress: Callable[[str, float], None] | None` is told of
@@ -54,6 +72,7 @@ class TaskEntry:
       symbol_values: how many values a symbol has.
       cost: what a run takes, in words.
       paper_agent: the agent that runs under `paper` unless another is named: what the paper's table of the task is of.
+      title: as pages write it.
     """
 
     id: str
@@ -68,6 +87,11 @@ class TaskEntry:
     symbol_values: int = 0
     cost: str = ""
     paper_agent: str = DEFAULT_AGENT
+    title: str = ""
+
+    def __post_init__(self) -> None:
+        """A task without a title is called by its id."""
+        object.__setattr__(self, "title", self.title or self.id)
 
 
 @dataclasses.dataclass(frozen=True)
