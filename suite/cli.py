@@ -47,10 +47,19 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _dispatch(argv: list[str]) -> int:
+    args = parse(argv)
+    return importlib.import_module(f"suite.commands.{args.command}").execute(args)
+
+
+def parse(argv: list[str]) -> argparse.Namespace:
+    """The words of a command, with the command itself as `command`.
+
+    Raises:
+      UserError: an unknown command or option, a word too many or too few.
+    """
     if argv and not argv[0].startswith("-") and argv[0] not in COMMANDS:
         raise UserError(f"unknown command {argv[0]!r}; {did_you_mean(argv[0], COMMANDS)}")
-    modules = {name: importlib.import_module(f"suite.commands.{name}") for name in COMMANDS}
-    parser, parsers = _parsers(modules)
+    parser, parsers = _parsers({name: importlib.import_module(f"suite.commands.{name}") for name in COMMANDS})
     args, rest = parser.parse_known_args(argv)
     # argparse takes positional arguments in one go only: settings after an option are left over.
     options = [word.partition("=")[0] for word in rest if word.startswith("-")]
@@ -61,7 +70,7 @@ def _dispatch(argv: list[str]) -> int:
         raise UserError(f"unexpected argument {rest[0]!r}")
     if rest:
         args.overrides = [*args.overrides, *rest]
-    return modules[args.command].execute(args)
+    return args
 
 
 def _parsers(modules: dict[str, ModuleType]) -> tuple[_Parser, dict[str, _Parser]]:

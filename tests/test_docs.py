@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import json
+import os
 import re
-from pathlib import Path
+import shlex
+import subprocess
+import sys
+import tomllib
 
 import pandas as pd
 import pytest
 
-REPOSITORY = Path(__file__).parents[1]
+from suite import cli, registry
+from tests.documents import REPOSITORY, code, command_lines
+
 DOCUMENTS = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
 FOLDERS = ("suite", "adapters", "baselines", "leaderboards", "tests")
 
@@ -87,3 +94,43 @@ def test_the_table_of_measured_performance_is_the_boards():
     for task, row in shown.items():
         rows = board(task, "reward_percent" if task.startswith("craftax") else "return")
         assert row == {agent: rows[agent] for agent in row}
+
+
+def test_the_example_of_a_task_and_an_agent_runs(tmp_path):
+    """As a distribution of its own, in a process of its own, as a reader would try it."""
+    (tmp_path / "corridor.py").write_text(code("docs/extending.md", "python", "# corridor.py"))
+    project = tomllib.loads(code("docs/extending.md", "toml", "entry-points"))["project"]
+    installed = tmp_path / f"{project['name']}-{project['version']}.dist-info"  # what installing it would leave
+    installed.mkdir()
+    named = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    (installed / "METADATA").write_text(named)
+    groups = {group: "\n".join(map(" = ".join, entries.items())) for group, entries in project["entry-points"].items()}
+    (installed / "entry_points.txt").write_text("".join(f"[{group}]\n{lines}\n" for group, lines in groups.items()))
+    (line,) = (line for line in command_lines("docs/extending.md") if "corridor" in line)
+    _, *words = shlex.split(line)
+    done = subprocess.run(
+        [sys.executable, "-m", "suite.cli", *words, "--quiet", "--json", "--out", "runs"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{REPOSITORY}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["status"] == "finished"
+    record = json.loads((tmp_path / "runs/corridor/mfrl_patient/smoke/seed_0/record.json").read_text())
+    assert record["protocol"]["package_version"] == project["version"]
+
+
+@pytest.mark.parametrize("line", sorted({line for path in DOCUMENTS for line in command_lines(str(path))}))
+def test_commands_in_documents_are_understood(line):
+    """Their words and options, and the task, agent, preset and settings that they name; TASK is the reader's own."""
+    args = cli.parse(shlex.split(line)[1:])
+    if "task" in args and args.task not in ("TASK", "corridor"):
+        registry.resolve(args.task, args.agent, args.preset, args.overrides)
+
+
+def test_evidence_that_readme_compares_is_there():
+    (line,) = (line for line in command_lines("README.md") if line.startswith("suite compare"))
+    before, agents, behind = re.fullmatch(r"suite compare (.*)\{(.*)\}(.*)", line).groups()
+    assert all((REPOSITORY / f"{before}{agent}{behind}" / "seed_0").is_dir() for agent in agents.split(","))

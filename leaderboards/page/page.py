@@ -259,11 +259,12 @@ def _stories(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str
             order = [game for game in (*registry.family(family).games, *games) if game in games]
             panels = [_panel(games[game], table, game if len(games) > 1 else "") for game in dict.fromkeys(order)]
             first = panels[0].entries[0]
+            title = registry.family(family).title
             yield _figure(
                 plots.learning_curves(panels),
-                f"{registry.family(family).title}, preset {preset}: {panels[0].label}, of training episodes by when "
-                "they ended; mean over seeds, shaded its 95 % bootstrap interval. mfrl learns from real play alone, m5 and "
-                "m6 also from a learned world model, the oracle from the true game.",
+                f"{title}, preset {preset}: {panels[0].label}, of training episodes by when they ended; mean over "
+                "seeds, shaded its 95 % bootstrap interval. mfrl learns from real play alone, m5 and m6 also from a "
+                "learned world model, the oracle from the true game.",
                 first,
             )
 

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from suite import cli, registry
+from suite.registry import catalog
 from suite.runs.external import evaluate_policy
 from suite.runtime.errors import UserError
 from suite.runtime.reporting import QuietReporter
+from tests.documents import code
 from tests.tiny import CORRIDOR, PENNIES
 
 
@@ -117,3 +119,12 @@ def test_the_command(capsys):
     assert fields["episodes"] == 96 and fields["policy"] == "tests.runs.test_external:Seer"
     assert cli.main(["evaluate", "pennies"]) == 2
     assert "--policy module:Class" in capsys.readouterr().err
+
+
+def test_readmes_policy_plays_as_readme_says(tmp_path, monkeypatch, capsys):
+    (tmp_path / "mypolicy.py").write_text(code("README.md", "python", "class Caller"))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(registry, "TASKS", catalog.TASKS)
+    assert cli.main(["evaluate", "openspiel/leduc", "--policy", "mypolicy:Caller", "--quiet", "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert scores["episodes"] >= 1_000 and 0 < scores["normalized_return"] < 1

@@ -20,6 +20,7 @@ from suite.interface.batching import Batched
 from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
 from suite.runtime.errors import UserError
 from tests.contract import check_environment, check_spec, check_types
+from tests.documents import code
 from tests.tiny import CORRIDOR, Corridor, Pennies
 
 EXPORTED = sorted(id for id, task in registry.tasks().items() if task.family not in gymnasium_export.NOT_EXPORTED)
@@ -73,6 +74,14 @@ def test_every_single_agent_task_is_registered():
 def test_check_env(id):
     """Craftax (full) goes the way of Craftax-classic; compiling it alone takes half a minute."""
     check_env(gymnasium.make(f"adapters.gymnasium:suite/{id.replace('/', '_')}-v0").unwrapped)
+
+
+def test_readmes_example_runs():
+    """Behind `test_check_env`, which compiled the game that it plays."""
+    names: dict = {}
+    exec(code("README.md", "python", "gymnasium.make"), names)
+    assert names["game"].observation_space.contains(names["game"].step(1)[0])
+    assert isinstance(names["info"], dict) and names["leduc"].agents
 
 
 def test_check_env_of_a_tiny_task(corridor):
