@@ -18,9 +18,16 @@ from suite.configuration.schema import Config, hash_of
 from suite.records.record import RunRecord, episode_columns, protocol
 from suite.runtime.errors import UserError
 
-# What a result may differ in without being another agent's: when it is saved and evaluated, and what numbers the
-# device computes in, which "auto" decides (`suite.registry`).
-FREE = ("checkpoint.", "evaluation.", "seed", "policy.compute_type", "world_model.compute_type")
+# What a result may differ in without being another agent's: when it is saved and evaluated, what numbers the device
+# computes in, which "auto" decides (`suite.registry`), and by which kernel.
+FREE = (
+    "checkpoint.",
+    "evaluation.",
+    "seed",
+    "policy.compute_type",
+    "world_model.compute_type",
+    "world_model.attention",
+)
 # What a leaderboard keeps of a run's folder.
 EVIDENCE = ("config.json", "record.json", "episodes.csv", "evaluations.csv", "metrics.csv", "timing.csv")
 NOT_RANKED = "smoke"  # a preset for tests

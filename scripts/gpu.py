@@ -22,7 +22,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 # What differs between devices: products, scans, sampling, optimizers. Games and boards are the same everywhere.
-FAST_TESTS = ("tests/world_model", "tests/policy", "tests/tokenizers", "tests/agent", "tests/interface")
+FAST_TESTS = ("tests/nn", "tests/world_model", "tests/policy", "tests/tokenizers", "tests/agent", "tests/interface")
 TEST_MINUTES = 2.0
 BENCHES = (("craftax_classic", "mfrl"), ("craftax_classic", "m5"))
 RUNS = (("craftax_classic", "mfrl"), ("openspiel/tic_tac_toe", "m5"))

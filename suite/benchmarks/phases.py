@@ -14,6 +14,7 @@ from suite.agent.algorithm import iterate, iteration_key, start_key
 from suite.agent.dyna import Agent
 from suite.benchmarks.comparisons import (
     Rows,
+    compare_attention,
     compare_caches,
     compare_resets,
     compare_samplers,
@@ -56,11 +57,13 @@ def bench(config: Config, reporter: Reporter, start_up: bool = True) -> dict[str
     phases = phase_table(agent, config, peak, reporter)
     report["phases of one iteration"] = phases
     report |= _summary(config, agent, phases)
-    reporter.message("racing the environment's resets")
+    reporter.message("comparing ways to reset the environment")
     report["environment steps/s, random actions"] = compare_resets(config, environment)
     if config.world_model.enabled:
-        reporter.message("racing the key-value cache")
+        reporter.message("comparing with and without the key-value cache")
         report["one imagined step"] = compare_caches(agent)
+        reporter.message("comparing ways to compute attention")
+        report["attention of one layer, forward and backward"] = compare_attention(agent)
         if samplers := compare_samplers(agent):
             report["one imagined frame"] = samplers
     if start_up:

@@ -131,6 +131,8 @@ class WorldModelConfig:
     dropout: Rate = 0.1  # embedding, attention and residual
     initial_std: PositiveFloat = 0.02  # of every kernel and embedding, GPT-2's; narrow models learn faster from more
     positions: Literal["flat", "grid"] = "flat"  # RoPE over the token index, or over (time, row, column): note 20
+    # How attention is computed: plain operations, or one kernel for GPUs (suite/nn/fused_attention.py).
+    attention: Literal["plain", "fused"] = "plain"
     # This and the next six are not the paper's (docs/agents.md): copy tokens from near their place, or make them new.
     correspondence: bool = False
     correspondence_radius: NotNegative = 1  # of the square that is copied from; symbols: their own place alone
@@ -319,6 +321,9 @@ def _problems(config: Config) -> Iterator[str]:
         )
     if (model.embed_dim // model.heads) % 2:
         yield f"world_model.embed_dim / world_model.heads = {model.embed_dim / model.heads:g} must be even (RoPE)"
+    width = model.embed_dim // model.heads
+    if model.attention == "fused" and (width < 16 or width & (width - 1)):
+        yield f"world_model.attention=fused needs heads of width 16, 32, 64 ..., not embed_dim / heads = {width}"
     if config.policy.kind == "moon" and (config.policy.rnn_size or not config.policy.embedding_size):
         yield "policy.kind=moon has no memory and an embedding: policy.rnn_size=0, and policy.embedding_size above 0"
     if model.patch_contents and config.tokenizer.kind != "nearest_neighbor":

@@ -10,6 +10,7 @@ tokens are no codes but vectors (`TokenSpec.token_size`), arrays of them have a 
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ from jax.typing import DTypeLike
 from suite.configuration.schema import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.nn.dropout import dropout
+from suite.nn.fused_attention import fused_attention
 from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
 from suite.world_model.factorization import factorization
@@ -107,6 +109,8 @@ class WorldModel(nnx.Module):
         self.block = tokens.tokens_per_frame + 1
         self.factorization = factorization(config.block_teacher_forcing)
         self.unit = self.factorization.unit(self.block)
+        plain = functools.partial(causal_attention, block=self.block)
+        self._attend = fused_attention if config.attention == "fused" else plain
         self.dtype = jnp.bfloat16 if config.compute_type == "bfloat16" else jnp.float32
         self.codes_per_place = tokens.num_codes if tokens.placed else 0
         codes = tokens.num_codes * (tokens.tokens_per_frame if tokens.placed else 1)
@@ -174,11 +178,10 @@ class WorldModel(nnx.Module):
             key = None if layer_key is None else jax.random.fold_in(layer_key, index)
             attention_key, residual_key = _split(key, 2)
             query, key_, value = (y.reshape(batch, -1, *y.shape[1:]) for y in layer.attention_inputs(x))
-            attended = causal_attention(
+            attended = self._attend(
                 rope(query, position_SA),
                 rope(key_, position_SA),
                 value,
-                block=self.block,
                 unit=self.unit,
                 dropout_rate=rate,
                 dropout_key=attention_key,

@@ -32,6 +32,8 @@ def test_every_phase_is_measured_and_projected(monkeypatch):
     assert report["one imagined step"][0]["times faster"] > 0
     assert [row["tokens"] for row in report["one imagined frame"]] == ["as a block", "token by token"]
     assert all(row["ms"] > 0 for row in report["one imagined frame"])
+    attention = report["attention of one layer, forward and backward"]
+    assert [row["attention"] for row in attention] == ["ours, plain operations", "jax.nn.dot_product_attention"]
 
 
 def test_hosted_engines_are_compared_without_the_variant_that_plays_past_the_end(monkeypatch):
