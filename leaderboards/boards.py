@@ -17,7 +17,7 @@ from leaderboards.published import OF_FAMILY, published
 from leaderboards.qualification import evidence_files, overrides
 from leaderboards.results import Entry
 from suite import registry
-from suite.records.schema import DeviceFields, RecordFields
+from suite.records.fields import DeviceFields, RecordFields
 
 COLUMNS = (
     "task",

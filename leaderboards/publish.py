@@ -1,4 +1,4 @@
-"""`suite publish` and `suite verify`: from run records to leaderboards, and back.
+"""`suite publish`: from run records to leaderboards. The way back is `leaderboards.verification`.
 
 A folder of leaderboards holds `evidence/`, the small files of every run that a row of ours is of, and CSV files made of
 nothing but that evidence and `published.csv`. So publishing twice writes the same bytes, and anyone can check them.
@@ -6,15 +6,13 @@ nothing but that evidence and `published.csv`. So publishing twice writes the sa
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pandas as pd
 
-from leaderboards.boards import Standing, as_csv, boards, tables_digest
+from leaderboards.boards import Standing, as_csv, boards
 from leaderboards.qualification import Refusal, evidence_files, examine, overrides, settings
 from leaderboards.results import Entry, entries_of, run_folders
 from suite.configuration.schema import hash_of
@@ -82,31 +80,11 @@ def publish(runs: Sequence[Path], out: Path) -> Publication:
     )
 
 
-def verify(out: Path) -> list[str]:
-    """Recomputes every leaderboard in a folder from its evidence; returns each difference as one line.
-
-    Raises:
-      UserError: there is no evidence in the folder.
-    """
+def evidence_in(out: Path) -> tuple[list[Standing], list[Refusal]]:
+    """What a folder of leaderboards has evidence of, and what of that does not qualify."""
     kept, _ = _collect([], out)
-    if not kept:
-        raise UserError(f"no run in {out / 'evidence'}: nothing to verify {out} with")
     qualified, refusals = _examined(kept, [])
-    problems = [f"evidence does not qualify: {refusal}" for refusal in refusals]
-    tables = {name: as_csv(board) for name, board in boards(_standings(qualified, out)).items()}
-    for name, content in tables.items():
-        problems += (f"{name}: {problem}" for problem in _differences(out / name, content))
-    page = out / PAGE
-    if page.exists() and f'content="{tables_digest(tables)}"' not in page.read_text(errors="replace"):
-        problems.append(f"{PAGE}: made from other tables: publish again with --page {out}")
-    others = {path.name for path in out.glob("*.csv")} - tables.keys() - {"published.csv"}
-    return [*problems, *(f"{name}: made from no evidence" for name in sorted(others))]
-
-
-def standings_in(out: Path) -> list[Standing]:
-    """What a folder of leaderboards has evidence of that qualifies."""
-    kept, _ = _collect([], out)
-    return _standings(_examined(kept, [])[0], out)
+    return _standings(qualified, out), refusals
 
 
 def _collect(runs: Iterable[Path], out: Path) -> tuple[list[Path], list[Path]]:
@@ -155,8 +133,9 @@ def _examined(kept: list[Path], new: list[Path]) -> tuple[list[RunRecord], list[
 def _standings(records: list[RunRecord], out: Path) -> list[Standing]:
     """Entries, and where their evidence lies or will lie.
 
-    What is there stays where it is. What comes has folders as in `runs/`, unless fields differ from the preset's or
-    another entry has that folder, e.g. one of another version of the game: then a key is added to the preset.
+    Evidence that is there already is not moved. New evidence gets a folder as in `runs/`. If its fields differ from the
+    preset's, or if another entry has that folder (one of another version of the game, say), a key is added to the
+    preset's name.
     """
     entries = entries_of(records)
     paths: dict[Path, Path] = {}
@@ -175,28 +154,3 @@ def _standings(records: list[RunRecord], out: Path) -> list[Standing]:
         for record in entry.records:
             paths.setdefault(record.folder, home / f"seed_{record.config.seed}")
     return [Standing(entry, tuple(paths[record.folder] for record in entry.records)) for entry in entries]
-
-
-def _differences(path: Path, expected: bytes) -> list[str]:
-    """What a CSV file says otherwise, row by row."""
-    try:
-        present = path.read_bytes()
-    except OSError as error:
-        return [f"cannot be read ({error.strerror})"]
-    if present == expected:
-        return []
-    rows, right = (list(csv.reader(io.StringIO(text.decode(errors="replace")))) for text in (present, expected))
-    if rows[:1] != right[:1]:
-        return ["the columns are not those of this version: publish again"]
-    problems = [] if len(rows) == len(right) else [f"{len(rows) - 1} rows, the evidence gives {len(right) - 1}"]
-    header = right[0]
-    for number, (row, true) in enumerate(zip(rows[1:], right[1:], strict=False), 2):
-        cells = [
-            f"{name} is {cell!r}, the evidence gives {value!r}"
-            for name, cell, value in zip(header, row, true, strict=False)
-            if cell != value
-        ]
-        if cells or len(row) != len(true):
-            method, metric = (true[header.index(name)] for name in ("method", "metric"))
-            problems.append(f"line {number} ({method}, {metric}): {'; '.join(cells) or 'not as many cells'}")
-    return problems or ["other bytes, though the cells are the same: publish again"]

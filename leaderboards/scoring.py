@@ -44,8 +44,8 @@ def craftax(
     Args:
       episodes: one row per training episode: `step` at which it ended, `return`, `achievement_return`, and a 0/1 column
         for each achievement.
-      config: says the budget, beyond which episodes do not count, and its last part, in which those end that rewards
-        are of; without it all episodes count alike, as in an evaluation.
+      config: says the budget, beyond which episodes do not count, and its last part: rewards are of episodes that end
+        in it. Without a configuration all episodes count alike, as in an evaluation.
       spec: the game's; says what each achievement pays.
 
     Returns:

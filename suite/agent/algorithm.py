@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.agent.state import TrainState
 
 Call = Callable[..., Any]

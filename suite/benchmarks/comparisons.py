@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from suite import registry
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.configuration.schema import Config
 from suite.interface.batching import Batched
 from suite.interface.environment import BatchedEnvironment, Environment
@@ -28,7 +28,7 @@ from suite.interface.turns import choose_event
 from suite.nn.fused_attention import fused_attention
 from suite.runtime.compilation import enable_compilation_cache
 from suite.world_model.attention import causal_attention
-from suite.world_model.factorization import factorization
+from suite.world_model.block_teacher_forcing import factorization
 from suite.world_model.imagination import next_frame
 from suite.world_model.transformer import WorldModel
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from suite import registry
 from suite.agent.algorithm import iterate, iteration_key, start_key
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.benchmarks.comparisons import (
     Rows,
     compare_attention,

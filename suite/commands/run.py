@@ -81,6 +81,9 @@ def _print_result(result: Result) -> None:
     elif result.status == "already finished":
         print("already finished: nothing was run")
     print_scores(result.scores)
+    if result.evaluation and not result.scores["episodes"]:
+        print(f"the final policy, over {result.evaluation['episodes']} whole episodes of evaluation:")
+        print_scores(result.evaluation)
     print(f"record {result.folder}", flush=True)
 
 

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from leaderboards.publish import verify
+    from leaderboards.verification import verify
 
     problems = verify(args.folder)
     for problem in problems:

@@ -334,6 +334,8 @@ def _problems(config: Config) -> Iterator[str]:
                 f"world_model.{name} needs world_model.block_teacher_forcing=true and a tokenizer.kind whose "
                 "tokens are codes"
             )
+    if dream.min_p and not model.block_teacher_forcing:
+        yield f"imagination.min_p={dream.min_p} needs world_model.block_teacher_forcing=true"
     if config.tokenizer.kind == "continuous" and not model.block_teacher_forcing:
         yield "tokenizer.kind=continuous needs world_model.block_teacher_forcing=true: its tokens are no codes"
     if config.protocol.steps < config.steps_per_iteration:

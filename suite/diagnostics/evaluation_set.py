@@ -18,7 +18,7 @@ import numpy as np
 
 from suite import registry
 from suite.agent.algorithm import iterate, iteration_key, start_key
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.configuration.schema import Config, hash_of
 from suite.interface.environment import Environment, EnvironmentSpec, State, TimeStep
 from suite.records.tables import write_whole

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.diagnostics.evaluation_set import EvaluationSet
 from suite.interface.tokens import TokenizerState, TokenSpec
 from suite.world_model.ages import ages_of

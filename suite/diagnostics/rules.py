@@ -16,7 +16,7 @@ import numpy as np
 from flax import nnx, struct
 
 from suite.agent import rollout as play
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.interface.environment import State, TimeStep
 from suite.interface.turns import CHANCE, Turn
 from suite.policy.actor_critic import UniformPolicy

@@ -7,7 +7,7 @@
     episodes.csv      one row per real training episode
     metrics.csv       one row per iteration
     evaluations.csv   one row per evaluation episode; never mixed with training's
-    timing.csv        seconds per phase, one row per iteration
+    timing.csv        seconds per phase, one row per iteration (of evaluations, record.json has the sum)
     tensorboard/      the metrics as curves
     checkpoints/      see `suite.records.checkpoint`
     replaced/         rows of iterations that a resumed run played again
@@ -32,8 +32,8 @@ from pydantic import ValidationError
 from suite import registry
 from suite.configuration.overrides import dotted, first_problem
 from suite.configuration.schema import Config
+from suite.records.fields import SCHEMA, ProtocolFields, RecordFields, read_json, write_json
 from suite.records.provenance import package_version, peak_memory, provenance
-from suite.records.schema import SCHEMA, ProtocolFields, RecordFields, read_json, write_json
 from suite.records.tables import CsvTable
 from suite.runtime.errors import RunError, UserError
 

@@ -48,7 +48,7 @@ def _game(name: str, summary: str = "", cost: str = "", small: str = "openspiel_
 def _minatar(
     name: str,
     summary: str,
-    cost: str = "small on one CPU core: m5 4 min, mfrl 1, 1.0 GiB",
+    cost: str = "small on one CPU core: m6 7 to 10 min, m5 6 to 8, mfrl 1, 1.9 GiB",
     small: str = "minatar_small",
 ) -> TaskEntry:
     return TaskEntry(
@@ -308,7 +308,12 @@ AGENTS = (
 )
 
 PRESETS = (
-    PresetEntry("paper", "the paper's Appendix A; only these results are ranked (default on an accelerator)"),
+    PresetEntry(
+        "paper", "the paper's Appendix A; only these compare with the paper's results (default on an accelerator)"
+    ),
     PresetEntry("small", "scaled down so that two CPU cores learn something in minutes (default on a CPU)"),
-    PresetEntry("smoke", "two iterations within seconds, for tests; learns nothing"),
+    PresetEntry(
+        "smoke",
+        "two iterations, for tests: a minute or more to compile, then seconds; too short to learn or to end an episode",
+    ),
 )

@@ -62,8 +62,8 @@ class TaskEntry:
       spec: an `EnvironmentSpec`.
       make: a function that builds the environment; its `progress: Callable[[str, float], None] | None` is told of
         preparations that take long.
-      scores: a function of (episodes, configuration or None, specification) to numbers by name; None: all episodes
-        count alike, as in an evaluation.
+      scores: a function of (episodes, configuration or None, specification) to numbers by name. Where the configuration
+        is None all episodes count alike, as in an evaluation.
       presets: by name, functions `Config -> Config`; they see the agent's id in `config.agent`.
       own_auto_reset: the batched environment, made from a number of environments, that resets as the package itself
         does; for `suite bench` only. None: it has no auto-reset.

@@ -11,7 +11,7 @@ import pandas as pd
 
 from suite import registry
 from suite.agent.algorithm import evaluation_key
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.agent.rollout import EpisodeLog
 from suite.interface.environment import EnvironmentSpec
 from suite.policy.ppo import PolicyTrainState

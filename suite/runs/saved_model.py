@@ -9,7 +9,7 @@ import jax
 from flax import struct
 
 from suite import registry
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.agent.replay import ReplayState
 from suite.agent.rollout import RolloutState
 from suite.agent.state import TrainState

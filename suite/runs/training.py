@@ -15,7 +15,7 @@ import numpy as np
 
 from suite import registry
 from suite.agent.algorithm import iterate, iteration_key, start_key
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.agent.state import TrainState
 from suite.configuration.schema import Config
 from suite.records import checkpoint
@@ -30,13 +30,23 @@ PHASES = ("start", "collect", "learn", "tokenizer", "world_model", "imagine", "c
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What a run came to. `status`: "finished", "stopped" (by a signal) or "already finished"."""
+    """What a run came to.
+
+    Attributes:
+      folder: where its record is.
+      status: "finished", "stopped" (by a signal) or "already finished".
+      steps: real steps taken.
+      wall_seconds: of all its processes.
+      scores: by name, from its training episodes.
+      evaluation: by name, from the episodes of its newest evaluation; empty if there was none.
+    """
 
     folder: Path
     status: str
     steps: int
     wall_seconds: float
     scores: dict[str, float]
+    evaluation: dict[str, float]
 
 
 def run(config: Config, out: Path, reporter: Reporter, resume: bool = False) -> Result:
@@ -234,5 +244,9 @@ class _Training:
 
 
 def _result(record: RunRecord, status: str) -> Result:
-    scores = registry.task(record.config.task).scores()(record.episodes(), record.config, record.spec)
-    return Result(record.folder, status, record.steps, record.wall_seconds, scores)
+    score = registry.task(record.config.task).scores()
+    scores = score(record.episodes(), record.config, record.spec)
+    evaluations = record.table("evaluations")
+    newest = evaluations[evaluations["step"] == evaluations["step"].max()]
+    evaluation = score(newest, None, record.spec) if len(newest) else {}
+    return Result(record.folder, status, record.steps, record.wall_seconds, scores, evaluation)

@@ -32,7 +32,8 @@ def causal_attention(
 
     The block as the unit gives the block-causal mask (Section 3.6, fidelity note 18), a single token the usual one.
 
-    Another kernel replaces this one function. Here the queries are cut into `groups` runs of whole blocks, each of
+    Another kernel for training replaces this one function, as `suite.nn.fused_attention` does; dreams use
+    `cached_attention`. Here the queries are cut into `groups` runs of whole blocks, each of
     which sees a static prefix of the keys: with a run for each block nothing that the first mask forbids is computed.
     The backward pass recomputes the weights: S * S of them are not kept.
 

@@ -65,10 +65,15 @@ class Sequences:
 
 @struct.dataclass
 class WorldModelTrainState:
-    """What training changes: the parameters (an `nnx.State`), the optimizer's state and perhaps moving averages.
+    """What training changes.
 
-    Those are of the parameters and, float32 [1 + R], of the loss of rewards on steps that the model had not learned
-    from and of how often each of the R classes of reward came in them; this one begins with zeros.
+    Attributes:
+      params: the parameters, an `nnx.State`.
+      optimizer: the optimizer's state.
+      averaged: a moving average of the parameters, which dreams use; None: they use the parameters.
+      measured: float32 [1 + R], moving averages over iterations, which begin with zeros: the loss of rewards on steps
+        that the model had not learned from, and how often each of the R classes of reward came in them. None: they
+        are not measured.
     """
 
     params: Any

@@ -1,8 +1,8 @@
 """The transformer world model: a GPT-2 over a stream of blocks [q_1 .. q_L, a] (Section 3.6, Appendix A.2.2).
 
-Which tokens see one another, and what the output at each of them predicts, is a matter of
-`suite.world_model.factorization`: block teacher forcing, or token by token. The output at a_t predicts reward and
-termination, and in a two-player game who is next, what is then legal, and the probabilities of chance (Section 4.7,
+Which tokens see one another, and what the output at each of them predicts, is decided by
+`suite.world_model.block_teacher_forcing`: block teacher forcing, or token by token. The output at a_t predicts reward
+and termination, and in a two-player game who is next, what is then legal, and the probabilities of chance (Section 4.7,
 Appendix G).
 Shapes: B streams, T time steps, L tokens per frame, S = L + 1 tokens per block, D width, N heads, H = D / N. Where
 tokens are no codes but vectors (`TokenSpec.token_size`), arrays of them have a further last axis.
@@ -24,8 +24,8 @@ from suite.interface.tokens import TokenSpec
 from suite.nn.dropout import dropout
 from suite.nn.fused_attention import fused_attention
 from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
+from suite.world_model.block_teacher_forcing import factorization
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
-from suite.world_model.factorization import factorization
 from suite.world_model.heads import Head, PlaceHead, SymbolsHead, TurnHead, TurnLogits, filled_odds
 
 TERMINATION_CLASSES = 2

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from suite import registry
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.agent.replay import Replay
 from suite.interface.batching import Batched
 from tests.tiny import WIDE_CORRIDOR, WideCorridor

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from suite import registry
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.interface.tokens import TokenSpec
 from suite.runtime.errors import UserError
 from suite.world_model.training import known_share, reward_frequency

@@ -261,8 +261,9 @@ def test_m6_has_a_finer_codebook_on_craftax_alone(task, threshold, size):
     assert (coarse.threshold, coarse.codebook_size) == (0.75, 512)
 
 
-def test_every_agent_is_held_against_the_paper():
-    assert registry.agents().keys() == FROM_M5.keys() | FROM_MFRL.keys() | {"m5", "mfrl", "random"}
+def test_every_agent_of_the_paper_is_held_against_it():
+    of_the_paper = {id for id, entry in registry.agents().items() if entry.row}
+    assert of_the_paper <= FROM_M5.keys() | FROM_MFRL.keys() | {"m5", "mfrl"}
 
 
 @pytest.mark.parametrize("agent", ["m1", "m5_no_dyna"])

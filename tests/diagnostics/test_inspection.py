@@ -13,7 +13,7 @@ from flax import nnx
 from PIL import Image
 
 from suite import registry
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.diagnostics import evaluation_set, inspection, rollouts, symbols
 from suite.diagnostics.evaluation_set import Pairs, WithSymbols
 from suite.records import checkpoint

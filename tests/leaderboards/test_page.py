@@ -12,7 +12,7 @@ from leaderboards.boards import as_csv, boards, tables_digest
 from leaderboards.page import page as pages
 from leaderboards.page import plots
 from leaderboards.page.page import write_page
-from leaderboards.publish import standings_in
+from leaderboards.publish import evidence_in
 from leaderboards.results import Entry
 
 REPOSITORY = Path(__file__).parents[2]
@@ -24,7 +24,7 @@ SHOWN = ("craftax_classic", "minatar/breakout")
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """The page of a part of what is committed, and what it was made from."""
-    standings = [s for s in standings_in(REPOSITORY / "leaderboards") if s.entry.config.task in SHOWN]
+    standings = [s for s in evidence_in(REPOSITORY / "leaderboards")[0] if s.entry.config.task in SHOWN]
     tables = boards(standings)
     folder = tmp_path_factory.mktemp("page")
     return write_page([s.entry for s in standings], tables, folder), tables, standings

@@ -32,10 +32,9 @@ def test_published_numbers():
     published = {id: f"reward {reward}, score {score}" for id, (reward, score) in PUBLISHED.items()}
     published |= {"m5_annealed": "reward 65.71 +- 1.11 %"}  # Section 4.3 gives no score
     agents = registry.agents()
-    ours = {id for id in agents if id in ("random", "oracle") or id.startswith("m6")}
     assert {id: entry.published for id, entry in agents.items() if entry.published} == published
-    assert agents.keys() == published.keys() | ours
-    assert all(entry.row.startswith(("Table ", "Appendix ")) == (id not in ours) for id, entry in agents.items())
+    assert {id for id, entry in agents.items() if entry.row} == published.keys()
+    assert all(agents[id].row.startswith(("Table ", "Appendix ")) for id in published)
 
 
 def test_docstrings_name_the_published_numbers():
@@ -50,7 +49,7 @@ def test_everything_registered_can_be_imported():
         for lazy in (task.make, task.scores, *task.presets.values()):
             assert callable(lazy())
         assert task.spec().id == task.id
-        assert task.presets.keys() == registry.presets().keys()
+        assert task.presets.keys() <= registry.presets().keys() and {"small", "smoke"} <= task.presets.keys()
     for agent in registry.agents().values():
         assert callable(agent.configure())
 

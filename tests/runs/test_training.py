@@ -14,7 +14,7 @@ import pandas as pd
 import pytest
 
 from suite import registry
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.records.record import RunRecord
 from suite.runs import evaluation, training
 from suite.runs.saved_model import restore

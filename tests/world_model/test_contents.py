@@ -15,7 +15,7 @@ from suite.interface.environment import ObservationSpec
 from suite.runtime.errors import UserError
 from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
 from suite.world_model import training
-from suite.world_model.factorization import sample_one_by_one
+from suite.world_model.block_teacher_forcing import sample_one_by_one
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import GRID, SPEC, random_sequences, small_config
 

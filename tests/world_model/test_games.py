@@ -12,7 +12,7 @@ import pytest
 from flax import nnx
 
 from suite import registry
-from suite.agent.dyna import Agent
+from suite.agent.phases import Agent
 from suite.interface.turns import Turn
 from suite.world_model.heads import TurnLogits
 from suite.world_model.imagination import next_turn

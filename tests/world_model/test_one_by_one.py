@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.world_model.factorization import sample_one_by_one
+from suite.world_model.block_teacher_forcing import sample_one_by_one
 from suite.world_model.imagination import next_frame
 from suite.world_model.training import losses
 from tests.world_model.small import SPEC, random_sequences, small_config, small_model

@@ -1,4 +1,4 @@
-"""The agent of Algorithm 1, which learns from real and imagined play: its parts, and each phase of an iteration.
+"""The agent (`Agent`): its parts, and each phase of an iteration of Algorithm 1 as a compiled function.
 
 Each phase is one compiled function over donated state, with its loop inside; only metrics return to the host. The
 state is one pytree of arrays, so that several seeds can become its leading axis. `suite.agent.algorithm` runs
@@ -261,7 +261,7 @@ class Agent:
     def _measure(self, params: Any, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array) -> jax.Array:
         """Float32 [1 + R]: a model's loss of rewards on the newest iteration's steps, and each class's frequency.
 
-        Sequences are drawn among those that the newest iteration holds whole, and are as many as cover it once.
+        Sequences are drawn among those that lie entirely within the newest iteration, and are as many as cover it once.
         """
         model, config = nnx.merge(self.world_model_graph, params), self.config.world_model
         newest = self.config.environment.rollout_length - config.sequence_length

@@ -1,4 +1,4 @@
-"""How the probability of the next frame is written as a product: block teacher forcing, or token by token.
+"""Block teacher forcing, or token by token: how the probability of the next frame is written as a product.
 
 This is the paper's main idea (Section 3.6), and a configuration chooses between its two sides:
 
@@ -63,7 +63,7 @@ class Factorization(Protocol):
         """The hidden states [..., L, D] that predict tokens, of a block's [..., S, D]."""
 
     def targets(self, frame: jax.Array, following: jax.Array) -> jax.Array:
-        """What those predict, [..., L], of a frame's tokens and the following frame's, or of whatever each has one."""
+        """What those predict, [..., L], of two frames' tokens, or of any other array of one entry a token."""
 
     def lesson(self, sequences: Sequences, token_weight_BT: jax.Array) -> Lesson:
         """What to read of replayed sequences, and what to predict.
