@@ -118,7 +118,7 @@ def test_the_example_of_a_task_and_an_agent_runs(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["status"] == "finished"
-    record = json.loads((tmp_path / "runs/corridor/mfrl_patient/smoke/seed_0/record.json").read_text())
+    record = json.loads((tmp_path / "runs/corridor/mfrl_curious/smoke/seed_0/record.json").read_text())
     assert record["protocol"]["package_version"] == project["version"]
 
 
