@@ -1,4 +1,4 @@
-"""Agents beyond the paper: `m6`, what each of its parts is worth, and the bound of every agent that dreams."""
+"""Agents that are not the paper's: `m6`, what each of its parts is worth, and the bound of every agent that dreams."""
 
 from __future__ import annotations
 

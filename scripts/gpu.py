@@ -63,7 +63,7 @@ def main(
         return max(end - time.monotonic(), 0.0)
 
     failed = []
-    if not _test(args.out / "tests.json", tests, min(60 * TEST_MINUTES, left()), environment):
+    if not run_tests(args.out / "tests.json", tests, min(60 * TEST_MINUTES, left()), environment):
         failed.append("tests")
     for task, agent in benches:
         path = args.out / f"bench_{task.replace('/', '_')}_{agent}.json"
@@ -72,7 +72,7 @@ def main(
     for index, (task, agent) in enumerate(runs):
         seconds = left() * (1.0 if index == len(runs) - 1 else FIRST_RUN) - LAST_CHECKPOINT
         run = [task, "--agent", agent, "--preset", args.preset, "--out", str(args.out / "runs")]
-        if seconds > 0 and not _run(run, seconds, environment):
+        if seconds > 0 and not train(run, seconds, environment):
             failed.append(f"run of {agent} on {task}")
     _keep(args.out / "runs", args.out / "records")
     print(f"results in {args.out}; records for `suite publish` in {args.out / 'records'}")
@@ -91,7 +91,7 @@ def _device() -> dict[str, Any]:
     return json.loads(found.stdout.splitlines()[-1])
 
 
-def _test(path: Path, tests: Sequence[str], seconds: float, environment: dict[str, str]) -> bool:
+def run_tests(path: Path, tests: Sequence[str], seconds: float, environment: dict[str, str]) -> bool:
     """Runs tests for so long; whether none failed. `path` gets the counts and what pytest printed last."""
     if path.exists():
         return json.loads(path.read_text())["failed"] == 0
@@ -127,7 +127,7 @@ def _bench(path: Path, words: Sequence[str], seconds: float, environment: dict[s
     return True
 
 
-def _run(words: Sequence[str], seconds: float, environment: dict[str, str]) -> bool:
+def train(words: Sequence[str], seconds: float, environment: dict[str, str]) -> bool:
     """`suite run` until it is finished or the time is up, when it stops with a checkpoint."""
     print(f"suite run {' '.join(words)}, for {seconds:.0f} s at most", flush=True)
     command = [sys.executable, "-m", "suite.cli", "run", *words, "--quiet"]

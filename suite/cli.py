@@ -1,8 +1,8 @@
 """The `suite` command: parsing, and errors as one line. What each word does is in `suite.commands`.
 
-Results go to stdout, progress and errors to stderr. Bad input is one line and exit code 2; a run that cannot go on
-is one line and exit code 1; a run that was told to stop exits with 130. Nothing that imports JAX is imported
-before the words of the command are known to be right.
+Results go to stdout, progress and errors to stderr. Bad input is one line and exit code 2, or 75 where another process
+has the run open and the same command may do later. A run that cannot go on is one line and exit code 1. A run that was
+told to stop exits with 130. Nothing that imports JAX is imported before the words of the command are known to be right.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from suite.runtime.compilation import quiet_xla
 from suite.runtime.errors import RunError, UserError, did_you_mean, host_errors
 
 COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "compare", "sweep", "publish", "verify", "bench")
-BAD_INPUT, FAILED, STOPPED = 2, 1, 130
+STOPPED = 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -31,13 +31,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _dispatch(sys.argv[1:] if argv is None else list(argv))
     except (UserError, RunError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return BAD_INPUT if isinstance(error, UserError) else FAILED
+        return error.exit_code
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return STOPPED
     except BrokenPipeError:  # whoever read our output has enough of it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
+        return RunError.exit_code
 
 
 class _Parser(argparse.ArgumentParser):

@@ -27,7 +27,7 @@ def walked(name: str) -> Tables:
 @functools.cache
 def game(name: str) -> openspiel.TableGame:
     tables = walked(name)
-    return openspiel.TableGame(openspiel._SPECS.get(name) or openspiel._measure(name, tables), tables)
+    return openspiel.TableGame(openspiel.SPECS.get(name) or openspiel.measured(name, tables), tables)
 
 
 def play(environment, steps: int, num_envs: int, seed: int = 0):

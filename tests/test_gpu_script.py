@@ -54,7 +54,7 @@ def test_a_run_that_the_time_ends_keeps_a_checkpoint_and_goes_on(gpu, tmp_path):
 
     def go_on(before):
         for _ in range(8):  # a busy machine may not get to the first iteration in time
-            assert gpu._run(run, 10.0, dict(os.environ))
+            assert gpu.train(run, 10.0, dict(os.environ))
             if (folder / "record.json").exists():
                 record = json.loads((folder / "record.json").read_text())
                 if record["status"] == "stopped" and record["steps"] > before:
@@ -67,11 +67,11 @@ def test_a_run_that_the_time_ends_keeps_a_checkpoint_and_goes_on(gpu, tmp_path):
 
 def test_a_test_that_fails_and_one_that_takes_too_long(gpu, tmp_path):
     (tmp_path / "test_bad.py").write_text("def test_good(): pass\ndef test_bad(): assert False\n")
-    assert not gpu._test(tmp_path / "bad.json", [str(tmp_path / "test_bad.py")], 60.0, dict(os.environ))
+    assert not gpu.run_tests(tmp_path / "bad.json", [str(tmp_path / "test_bad.py")], 60.0, dict(os.environ))
     found = json.loads((tmp_path / "bad.json").read_text())
     assert (found["passed"], found["failed"], found["in_time"]) == (1, 1, True)
     (tmp_path / "test_slow.py").write_text("import time\ndef test_slow(): time.sleep(600)\n")
-    assert gpu._test(tmp_path / "slow.json", [str(tmp_path / "test_slow.py")], 5.0, dict(os.environ))
+    assert gpu.run_tests(tmp_path / "slow.json", [str(tmp_path / "test_slow.py")], 5.0, dict(os.environ))
     assert json.loads((tmp_path / "slow.json").read_text())["in_time"] is False
 
 

@@ -56,7 +56,7 @@ def _specification(
     )
 
 
-_SPECS = {
+SPECS = {
     "tic_tac_toe": _specification("tic_tac_toe", 27, 1, 9, 0, SIGNS, True),
     "leduc": _specification(
         "leduc", 16, 13, 3, 6, SIGNS, False
@@ -77,8 +77,8 @@ def spec(name: str) -> EnvironmentSpec:
     Raises:
       UserError: no such game, or none that can be played here; see `make`.
     """
-    name = _canonical(name)
-    return _SPECS.get(name) or _specified(name, _walked(name, None))
+    name = canonical_name(name)
+    return SPECS.get(name) or _specified(name, _walked(name, None))
 
 
 def make(name: str, progress: Progress | None = None) -> Environment:
@@ -94,9 +94,9 @@ def make(name: str, progress: Progress | None = None) -> Environment:
       UserError: the game is unknown; or its players move at once, or are not two; or what they see is not a vector
         of symbols.
     """
-    name = _canonical(name)
+    name = canonical_name(name)
     tables = _walked(name, progress)
-    spec = _SPECS.get(name) or _specified(name, tables)
+    spec = SPECS.get(name) or _specified(name, tables)
     return host.make(_engine(name), spec) if tables is None else TableGame(spec, tables)
 
 
@@ -109,7 +109,7 @@ def walked(name: str, progress: Progress | None = None) -> Tables:
     Raises:
       UserError: as `make`; or the game is too large for tables.
     """
-    tables = _walked(_canonical(name), progress)
+    tables = _walked(canonical_name(name), progress)
     if tables is None:
         raise UserError(f"openspiel/{name} is too large for tables")
     return tables
@@ -123,7 +123,7 @@ def _walked(name: str, progress: Progress | None) -> Tables | None:
     version = importlib.metadata.version("open_spiel")
     path = cache_dir() / "openspiel" / f"{name}-{version}-{_SCHEMA}.npz"
     too_large = path.with_name(f"{path.stem}.too_large")  # an empty file
-    tables = _read(path)
+    tables = read_tables(path)
     if tables is None and not too_large.exists():
         game = _engine(name)
         key = game_tables.last_offer if name == "bargaining" else None
@@ -263,16 +263,18 @@ def _entry(table: jax.Array, index: Any, otherwise: int) -> jax.Array:
     return table.at[index].get(mode="fill", fill_value=otherwise, wrap_negative_indices=False)
 
 
-def _canonical(name: str) -> str:
+def canonical_name(name: str) -> str:
+    """The name in `GAMES` of a game that is there, else the library's."""
     return {game: short for short, game in GAMES.items()}.get(name, name)
 
 
 def _specified(name: str, tables: Tables | None) -> EnvironmentSpec:
     """The specification that a game's tables imply, or random play where there are none."""
-    return _measure(name, tables) if tables else _measure_by_play(name)
+    return measured(name, tables) if tables else measured_by_play(name)
 
 
-def _measure(name: str, tables: Tables) -> EnvironmentSpec:
+def measured(name: str, tables: Tables) -> EnvironmentSpec:
+    """What a game's tables say that it is."""
     levels = tuple(float(level) for level in np.union1d(tables.return_2N[:, tables.num_open :], [0.0]))
     return _specification(
         name,
@@ -286,7 +288,8 @@ def _measure(name: str, tables: Tables) -> EnvironmentSpec:
 
 
 @functools.lru_cache(maxsize=16)
-def _measure_by_play(name: str) -> EnvironmentSpec:
+def measured_by_play(name: str) -> EnvironmentSpec:
+    """What random play says that a game is."""
     game = _engine(name)
     symbols = int(np.prod(game.observation_tensor_shape()))
     actions, outcomes = game.num_distinct_actions(), game.max_chance_outcomes()
@@ -341,7 +344,7 @@ def _engine(name: str) -> Any:
     raise UserError(f"openspiel/{name} cannot be played here: {reason}")
 
 
-def _read(path: Path) -> Tables | None:
+def read_tables(path: Path) -> Tables | None:
     """The tables in a cache file; None if there is no file, or it is broken and must be made again."""
     names = {field.name for field in dataclasses.fields(Tables)}
     broken = OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error

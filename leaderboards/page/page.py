@@ -257,7 +257,7 @@ def _stories(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str
     for (family, preset), games in games_of.items():
         if games:
             order = [game for game in (*registry.family(family).games, *games) if game in games]
-            panels = [_panel(games[game], table, game if len(games) > 1 else "") for game in dict.fromkeys(order)]
+            panels = [panel_of(games[game], table, game if len(games) > 1 else "") for game in dict.fromkeys(order)]
             first = panels[0].entries[0]
             title = registry.family(family).title
             yield _figure(
@@ -273,7 +273,7 @@ def _runs(entries: Sequence[Entry]) -> int:
     return sum(len(entry.seeds) for entry in entries)
 
 
-def _panel(entries: Sequence[Entry], table: pd.DataFrame, title: str) -> plots.Panel:
+def panel_of(entries: Sequence[Entry], table: pd.DataFrame, title: str) -> plots.Panel:
     """Of one game; with the best published score for the same budget."""
     score, steps = entries[0].main_score, entries[0].config.protocol.steps
     theirs = table[
@@ -290,7 +290,7 @@ def _panel(entries: Sequence[Entry], table: pd.DataFrame, title: str) -> plots.P
 def _figures(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str, Any]]:
     """Of a task, the rest: one set for each preset and protocol that runs were made under."""
     for (_, preset, _), group in _groups(entries).items():
-        panel = _panel(group, table, "")
+        panel = panel_of(group, table, "")
         score, label = panel.score, panel.label
         under = f"Preset {preset}, {group[0].config.protocol.steps:,} steps"
         if any(entry.config.agent not in (*plots.STORY, "random") for entry in group):

@@ -206,13 +206,13 @@ class Agent:
         if config.patch_contents and self.tokens.content_size:
             model_state = model_state.with_contents(self.tokenizer.contents(tokenizer))
         if model_state.measured is not None:
-            new = self._measure(model_state.dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
+            new = self.measure_rewards(model_state.dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
             measured = model_state.measured + (new - model_state.measured) / plan.trust_window
             model_state = dataclasses.replace(model_state, measured=measured)
 
         def update(model_state, key):
             sample_key, dropout_key = jax.random.split(key)
-            sequences = self._replayed(tokenizer, replay, sample_key)
+            sequences = self.replayed_sequences(tokenizer, replay, sample_key)
             model_state, metrics = world_model_training.update(
                 config,
                 self.world_model_optimizer,
@@ -237,7 +237,7 @@ class Agent:
             metrics["reward_known"] = world_model_training.known_share(loss, frequency_R)
         return model_state, metrics
 
-    def _replayed(
+    def replayed_sequences(
         self, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array, recent: int = 0
     ) -> world_model_training.Sequences:
         """A minibatch of replayed sequences of T_WM + 1 frames; with `recent`, of those that ended so lately."""
@@ -258,7 +258,7 @@ class Agent:
             age_BTL=None if age_BTL is None else age_BTL[:, :-1],
         )
 
-    def _measure(self, params: Any, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array) -> jax.Array:
+    def measure_rewards(self, params: Any, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array) -> jax.Array:
         """Float32 [1 + R]: a model's loss of rewards on the newest iteration's steps, and each class's frequency.
 
         Sequences are drawn among those that lie entirely within the newest iteration, and are as many as cover it once.
@@ -267,7 +267,7 @@ class Agent:
         newest = self.config.environment.rollout_length - config.sequence_length
 
         def measure(key):
-            new = self._replayed(tokenizer, replay, key, newest)
+            new = self.replayed_sequences(tokenizer, replay, key, newest)
             _, metrics = world_model_training.losses(model, new, config, self.tokens)
             frequency_R = world_model_training.reward_frequency(self.tokens, new.reward_BT)
             return jnp.concatenate([metrics["reward_loss"][None], frequency_R])

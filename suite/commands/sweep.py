@@ -121,7 +121,7 @@ def _display(quiet: bool) -> Iterator[Callable[[Sequence[Run], bool], None]]:
         yield lambda runs, stopping: None
     elif console.is_terminal:
         with Live(console=console, auto_refresh=False, transient=True) as live:
-            yield lambda runs, stopping: live.update(_table(runs, stopping, console.height), refresh=True)
+            yield lambda runs, stopping: live.update(status_table(runs, stopping, console.height), refresh=True)
     else:
         yield _Lines(console)
 
@@ -150,7 +150,7 @@ class _Lines:
         self._stopping = stopping
 
 
-def _table(runs: Sequence[Run], stopping: bool, height: int) -> Group:
+def status_table(runs: Sequence[Run], stopping: bool, height: int) -> Group:
     """As many runs as fit into `height` lines, those first that matter most, and how many there are of each kind."""
     from rich.console import Group
     from rich.table import Table

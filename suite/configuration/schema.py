@@ -17,6 +17,9 @@ from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
+# The paper's tau: patches at most so far apart (squared distance of pixels from 0 to 1) count as the same.
+PATCH_THRESHOLD = 0.75
+
 T = TypeVar("T")
 Positive = Annotated[int, Field(gt=0)]
 NotNegative = Annotated[int, Field(ge=0)]
@@ -107,7 +110,7 @@ class TokenizerConfig:
     # Learned: vq_vae (whole frames; M1, M2), patch_vq_vae (M3). continuous: patches are not quantized but regressed.
     kind: Literal["nearest_neighbor", "vq_vae", "patch_vq_vae", "continuous"] = "nearest_neighbor"
     codebook_size: Positive = 4096  # K
-    threshold: NotNegativeFloat = 0.75  # tau, on the squared distance of patches in [0, 1] (note 13)
+    threshold: NotNegativeFloat = PATCH_THRESHOLD  # tau, on the squared distance of patches in [0, 1] (note 13)
     patch: tuple[Positive, Positive] | None = None  # None: the task's natural patch; the frame is padded to fill (37)
     updates: NotNegative = 25  # N_tok, each of `world_model.minibatches` minibatches
     # The rest belongs to the VQ-VAEs (note 15).

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
+from suite.configuration.schema import PATCH_THRESHOLD
 from suite.diagnostics.evaluation_set import EvaluationSet
 from suite.diagnostics.pictures import ALARM, INK, PAPER, as_rgb, enlarged, font
 from suite.records.tables import write_whole
 from suite.tokenizers.patches import patch_grid
-from suite.world_model.training import SAME_PATCH
 
 FRAME_SIDE = 190  # pixels, about
 PER_ROW = 7  # frames side by side; longer strips go on below
@@ -63,7 +63,7 @@ def differing(frame: np.ndarray, other: np.ndarray, patch: tuple[int, int], high
     rows, columns = patch_grid(frame.shape, patch)
     squared = np.square((frame.astype(np.float32) - other) / high).sum(-1)
     corners = [(r * patch[0], c * patch[1]) for r in range(rows) for c in range(columns)]
-    return [(y, x) for y, x in corners if squared[y : y + patch[0], x : x + patch[1]].sum() > SAME_PATCH]
+    return [(y, x) for y, x in corners if squared[y : y + patch[0], x : x + patch[1]].sum() > PATCH_THRESHOLD]
 
 
 def filmstrip(strip: Strip) -> Image.Image:

@@ -149,13 +149,13 @@ def _summary(parts: list[RuleCheck]) -> dict[str, float]:
         "terminated_percent": percent("terminated", followed),
         "return_percent": 100 * float(right.mean()),
         "chance_error_percent": percent("chance_error", followed & flat("chance_next")),
-        "chance_largest_z": _largest_z(flat("outcome")[followed], flat("odds")[followed]),
+        "chance_largest_z": largest_z(flat("outcome")[followed], flat("odds")[followed]),
         "games": len(right),
         "events": int(counted.sum()),
     }
 
 
-def _largest_z(outcome_N: np.ndarray, odds_NC: np.ndarray) -> float:
+def largest_z(outcome_N: np.ndarray, odds_NC: np.ndarray) -> float:
     """Largest standardized difference between how often an outcome was drawn and how often it should be."""
     drawn = outcome_N >= 0
     if not drawn.any():

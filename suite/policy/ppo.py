@@ -16,6 +16,8 @@ from flax import nnx, struct
 
 from suite.configuration.schema import PPOConfig
 from suite.interface.turns import Turn
+from suite.nn.masked import masked_mean
+from suite.nn.optimizer import clipped
 from suite.policy.actor_critic import PolicyOutput, log_probability, mask_logits
 
 # What `update` reports, in the order of tables and files.
@@ -204,7 +206,7 @@ class PolicyTrainState:
 
 def make_optimizer(ppo: PPOConfig) -> optax.GradientTransformation:
     """Adam behind gradient clipping, at the full learning rate; `update` anneals it."""
-    return optax.chain(optax.clip_by_global_norm(ppo.max_grad_norm), optax.adam(ppo.learning_rate, eps=ppo.adam_eps))
+    return clipped(optax.adam(ppo.learning_rate, eps=ppo.adam_eps), ppo.max_grad_norm)
 
 
 def update(
@@ -321,7 +323,7 @@ def _loss(
         "approx_kl": ratio_TB - 1.0 - log_ratio_TB,
         "clip_fraction": (jnp.abs(ratio_TB - 1.0) > ppo.clip).astype(jnp.float32),
     }
-    metrics = {name: _mean(part_TB, batch.known_TB) for name, part_TB in parts_TB.items()}
+    metrics = {name: masked_mean(part_TB, batch.known_TB) for name, part_TB in parts_TB.items()}
     loss = (
         metrics["policy_loss"]
         + ppo.value_coefficient * metrics["value_loss"]
@@ -330,15 +332,8 @@ def _loss(
     return loss, metrics
 
 
-def _mean(x: jax.Array, mask: jax.Array | None) -> jax.Array:
-    """Mean of `x` where `mask` (None: everywhere); 0 of nothing."""
-    if mask is None:
-        return x.mean()
-    return jnp.where(mask, x, 0.0).sum() / jnp.maximum(mask.sum().astype(x.dtype), 1.0)
-
-
 def _moments(x: jax.Array, mask: jax.Array | None) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Mean, standard deviation and number of entries of `x` where `mask` (None: everywhere)."""
-    mean = _mean(x, mask)
+    mean = masked_mean(x, mask)
     count = jnp.asarray(x.size) if mask is None else mask.sum()
-    return mean, jnp.sqrt(_mean(jnp.square(x - mean), mask)), count
+    return mean, jnp.sqrt(masked_mean(jnp.square(x - mean), mask)), count

@@ -35,7 +35,7 @@ from suite.configuration.schema import Config
 from suite.records.fields import SCHEMA, ProtocolFields, RecordFields, read_json, write_json
 from suite.records.provenance import package_version, peak_memory, provenance
 from suite.records.tables import CsvTable
-from suite.runtime.errors import RunError, UserError
+from suite.runtime.errors import FolderInUseError, RunError, UserError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -365,7 +365,7 @@ def _acquire(folder: Path) -> IO[str]:
         file.seek(0)
         owner = file.read().strip()
         file.close()
-        raise UserError(f"{folder} is in use by another process ({owner or 'just started'})") from None
+        raise FolderInUseError(f"{folder} is in use by another process ({owner or 'just started'})") from None
     file.truncate(0)
     file.write(f"pid {os.getpid()} on {platform.node()}")
     file.flush()

@@ -27,15 +27,16 @@ from typing import Any, Protocol
 from suite import registry
 from suite.configuration.schema import Config
 from suite.records.record import RunRecord, require_writable, run_folder
-from suite.runtime.errors import UserError
+from suite.runtime.errors import FolderInUseError, UserError
+from suite.runtime.signals import stop_signals
 
 CPUS_PER_RUN = 2
 PAUSE = 0.25  # seconds between two looks at the runs
 TAIL = 1 << 16  # bytes at the end of a file that are looked at
 RETRIES = 2  # of a run that died, unless the user says otherwise
 # The process of a sweep that was killed may still be at its last checkpoint when the same sweep starts again.
-IN_USE, PATIENCE, AGAIN = "in use by another process", 600.0, 3.0
-BAD_INPUT, STOPPED = 2, (130, -signal.SIGINT, -signal.SIGTERM)
+PATIENCE, AGAIN = 600.0, 3.0
+STOPPED = (130, -signal.SIGINT, -signal.SIGTERM)
 
 # What a process starts with: it asks Linux for a SIGTERM when its parent dies, and becomes `suite`. `preexec_fn` would
 # ask in a fork of the parent, which may have threads; between the fork and the question the parent may have died.
@@ -178,8 +179,8 @@ def sweep(
     """
     waiting = deque(run for run in runs if run.status == "waiting")
     going: dict[Run, Handle] = {}
-    told = 0
-    with _signals() as signals:
+    told, signals = 0, list[int]()
+    with stop_signals(signals.append):
         while going or (waiting and not signals):
             while waiting and not signals and (jobs is None or len(going) < jobs):
                 run = waiting.popleft()
@@ -277,11 +278,13 @@ class Process:
             return Outcome("stopped")
         reason = lines[-1] if lines else f"exit code {code}"
         now = time.monotonic()
-        if code == BAD_INPUT and IN_USE in reason and now < self._first + PATIENCE:
+        if code == FolderInUseError.exit_code and now < self._first + PATIENCE:
             self._next = now + AGAIN
             return None
         self._failures += 1
-        if code != BAD_INPUT and self._failures <= _allowed(self._retries, died):
+        if code not in (UserError.exit_code, FolderInUseError.exit_code) and self._failures <= _allowed(
+            self._retries, died
+        ):
             self._next = now
             return None
         return Outcome("failed", f"died of {signal.Signals(-code).name}" if died else reason.removeprefix("error: "))
@@ -370,18 +373,3 @@ def _device_memory_left_alone() -> Iterator[None]:
     finally:
         if not given:
             del os.environ[name]
-
-
-@contextlib.contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Collects SIGINT and SIGTERM, which then do nothing else."""
-    seen: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, frame: seen.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield seen
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -61,7 +61,7 @@ class Cluster:
             self.close()
             raise UserError(f"--gpus={gpus:g}: Ray finds {nodes[0].get('GPU', 0):g} on this machine")
         self._work: Any = ray.remote(_work).options(
-            num_cpus=_cpus([node.get("CPU", 0) for node in nodes], jobs),
+            num_cpus=cpus_per_run([node.get("CPU", 0) for node in nodes], jobs),
             num_gpus=gpus,
             max_retries=RETRIES if retries is None else retries,
             scheduling_strategy="SPREAD",
@@ -88,7 +88,7 @@ def _require_reachable(address: str) -> None:
         raise UserError(f"cannot use Ray at {address}: {error}") from error
 
 
-def _cpus(of_nodes: Sequence[float], jobs: int | None) -> float:
+def cpus_per_run(of_nodes: Sequence[float], jobs: int | None) -> float:
     """What one run asks for: no more than a node has, nor than its share where `jobs` go on at once."""
     cpus = min(CPUS_PER_RUN, max(of_nodes) or CPUS_PER_RUN)
     if jobs is None or not sum(of_nodes):

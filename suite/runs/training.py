@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -24,6 +23,7 @@ from suite.runs.evaluation import episode_rows, record_evaluation
 from suite.runs.saved_model import Remainder, SavedModel, agent_for
 from suite.runtime.errors import RunError, UserError, host_errors
 from suite.runtime.reporting import Reporter
+from suite.runtime.signals import stop_signals
 
 PHASES = ("start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint")
 
@@ -97,7 +97,7 @@ class _Training:
             with self._phase("start"):
                 state = self._restore()
             self.reporter.start(self.config.protocol.steps, self.steps)
-            with self._signals(), host_errors():
+            with stop_signals(self._heard), host_errors():
                 while not self.done and not self.stop_requested:
                     before = self.steps
                     state = self._iterate(state)
@@ -222,25 +222,12 @@ class _Training:
         self.record.finish(self.steps)
         checkpoint.drop_resume(self.checkpoints)
 
-    @contextlib.contextmanager
-    def _signals(self) -> Iterator[None]:
+    def _heard(self, count: int) -> None:
         """The first SIGINT or SIGTERM ends the run after this iteration, with a checkpoint; the second at once."""
-
-        def stop(number: int, frame: Any) -> None:
-            if self.stop_requested:
-                raise KeyboardInterrupt
-            self.stop_requested = True
-            self.reporter.message("stopping after this iteration, with a checkpoint (again: stop now)")
-
-        try:
-            before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-        except ValueError:  # not in the main thread: whoever runs us there handles signals
-            before = {}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        if count > 1:
+            raise KeyboardInterrupt
+        self.stop_requested = True
+        self.reporter.message("stopping after this iteration, with a checkpoint (again: stop now)")
 
 
 def _result(record: RunRecord, status: str) -> Result:

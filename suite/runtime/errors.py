@@ -1,4 +1,4 @@
-"""The two ways a command can fail that are not bugs. `suite.cli` turns both into one line on stderr."""
+"""The ways a command can fail that are not bugs. `suite.cli` turns each into one line on stderr."""
 
 from __future__ import annotations
 
@@ -9,11 +9,21 @@ from collections.abc import Iterable, Iterator
 
 
 class UserError(Exception):
-    """Bad input: one line that says what was wrong and what would be right. Exit code 2."""
+    """Bad input: one line that says what was wrong and what would be right."""
+
+    exit_code = 2
+
+
+class FolderInUseError(UserError):
+    """Another process has the run's folder open: the same command may do later."""
+
+    exit_code = 75  # "temporary failure" in BSD's sysexits.h
 
 
 class RunError(Exception):
-    """A run that cannot go on (diverged loss, full disk): one line. Exit code 1; the last checkpoint stays."""
+    """A run that cannot go on (diverged loss, full disk): one line. The last checkpoint stays."""
+
+    exit_code = 1
 
 
 def did_you_mean(word: str, valid: Iterable[str]) -> str:
@@ -33,7 +43,7 @@ def host_errors() -> Iterator[None]:
     except (UserError, RunError):
         raise
     except Exception as error:
-        quoted = re.search(r"^(?:suite\.errors\.)?(UserError|RunError): (.*)$", str(error), re.MULTILINE)
+        quoted = re.search(r"^(?:[\w.]+\.)?(UserError|RunError): (.*)$", str(error), re.MULTILINE)
         if quoted is None:
             raise
         raise {"UserError": UserError, "RunError": RunError}[quoted[1]](quoted[2]) from error

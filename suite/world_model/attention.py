@@ -65,14 +65,15 @@ def cached_attention(query_BQNH: jax.Array, key_BNSH: jax.Array, value_BNSH: jax
     These lead with the heads, as the products read them: nothing of the cache's size is moved.
     """
     if query_BQNH.shape[1] == 1:
-        return _attend_cached(query_BQNH, key_BNSH, value_BNSH, last_Q)
+        return attend_cached(query_BQNH, key_BNSH, value_BNSH, last_Q)
     # A CPU's caches hold the scores of one stream, not those of all: one after the other is twice as fast and more.
     return jax.lax.platform_dependent(
-        query_BQNH, key_BNSH, value_BNSH, last_Q, cpu=_attend_cached_in_turn, default=_attend_cached
+        query_BQNH, key_BNSH, value_BNSH, last_Q, cpu=_attend_cached_in_turn, default=attend_cached
     )
 
 
-def _attend_cached(query_BQNH, key_BNSH, value_BNSH, last_Q) -> jax.Array:
+def attend_cached(query_BQNH, key_BNSH, value_BNSH, last_Q) -> jax.Array:
+    """`cached_attention` of all streams at once, as on devices other than a CPU."""
     visible_QS = jnp.arange(key_BNSH.shape[2])[None] <= last_Q[:, None]
     mixed_BNQH, _ = _attend(query_BQNH.swapaxes(1, 2), key_BNSH, value_BNSH, visible_QS)
     return mixed_BNQH.swapaxes(1, 2)
@@ -81,7 +82,7 @@ def _attend_cached(query_BQNH, key_BNSH, value_BNSH, last_Q) -> jax.Array:
 def _attend_cached_in_turn(query_BQNH, key_BNSH, value_BNSH, last_Q) -> jax.Array:
     def attend(stream: tuple[jax.Array, ...]) -> jax.Array:
         query, key, value = (x[None] for x in stream)
-        return _attend_cached(query, key, value, last_Q)[0]
+        return attend_cached(query, key, value, last_Q)[0]
 
     return jax.lax.map(attend, (query_BQNH, key_BNSH, value_BNSH))
 

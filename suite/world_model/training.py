@@ -11,15 +11,16 @@ import optax
 from flax import nnx, struct
 from optax.contrib import MuonDimensionNumbers
 
-from suite.configuration.schema import WorldModelConfig
+from suite.configuration.schema import PATCH_THRESHOLD, WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.interface.turns import CHANCE, Turn
+from suite.nn.masked import masked_mean
+from suite.nn.optimizer import clipped
 from suite.world_model.correspondence import mixture_loss
 from suite.world_model.heads import TurnLogits
 from suite.world_model.transformer import WorldModel
 
 CHUNK_LOGITS = 2**25  # observation logits held at once: 128 MiB
-SAME_PATCH = 0.75  # squared distance up to which a regressed patch counts as right: that of patches that share a code
 METRICS: tuple[str, ...] = (
     "loss",
     "observation_loss",
@@ -116,7 +117,7 @@ def make_optimizer(config: WorldModelConfig) -> optax.GradientTransformation:
             consistent_rms=0.2,  # steps of Adam's size, so that one learning rate serves both
             muon_weight_dimension_numbers=_hidden_matrices,
         )
-    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optimizer)
+    return clipped(optimizer, config.max_grad_norm)
 
 
 def _hidden_matrices(params: nnx.State) -> Any:
@@ -152,7 +153,8 @@ def losses(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The sum of three cross-entropies in nats, means over tokens or steps, and scalar metrics.
 
-    Of tokens that are vectors the first is the squared Euclidean distance; one within `SAME_PATCH` counts as accurate.
+    Of tokens that are vectors the first is the squared Euclidean distance, and one within `PATCH_THRESHOLD` counts as
+    accurate.
 
     Observation + `reward_weight` * (reward + termination); in a game + `turn_losses`. Sequences may cross episodes;
     with `mask_after_done` only what comes before an episode's end counts: all three losses up to it, but not the
@@ -173,15 +175,15 @@ def losses(
         model.termination_logits(hidden_BTSD), sequences.terminated_BT.astype(jnp.int32)
     )
     metrics = {
-        "observation_loss": _mean(token_loss_BFL, lesson.weight_BFL),
-        "token_accuracy": _mean(correct_BFL, lesson.weight_BFL),
-        "changed_token_accuracy": _mean(correct_BFL, lesson.weight_BFL * changed_BFL.astype(jnp.float32)),
-        "reward_loss": _mean(reward_loss_BT, step_weight_BT),
-        "reward_accuracy": _mean(reward_correct_BT, step_weight_BT),
-        "termination_loss": _mean(termination_loss_BT, step_weight_BT),
+        "observation_loss": masked_mean(token_loss_BFL, lesson.weight_BFL),
+        "token_accuracy": masked_mean(correct_BFL, lesson.weight_BFL),
+        "changed_token_accuracy": masked_mean(correct_BFL, lesson.weight_BFL * changed_BFL.astype(jnp.float32)),
+        "reward_loss": masked_mean(reward_loss_BT, step_weight_BT),
+        "reward_accuracy": masked_mean(reward_correct_BT, step_weight_BT),
+        "termination_loss": masked_mean(termination_loss_BT, step_weight_BT),
     }
     if model.gate_head is not None:
-        metrics["copied_share"] = _mean(copied_BFL, lesson.weight_BFL)
+        metrics["copied_share"] = masked_mean(copied_BFL, lesson.weight_BFL)
     other = metrics["reward_loss"] + metrics["termination_loss"]
     loss = metrics["observation_loss"] + config.reward_weight * other
     if turn_BT is not None:
@@ -203,10 +205,10 @@ def turn_losses(logits_BT: TurnLogits, turn_BT: Turn, weight_BT: jax.Array) -> t
     legal_loss_BT = optax.sigmoid_binary_cross_entropy(logits_BT.legal, turn_BT.legal_A.astype(jnp.float32)).mean(-1)
     legal_correct_BT = ((logits_BT.legal > 0) == turn_BT.legal_A).all(-1).astype(jnp.float32)
     metrics = {
-        "player_loss": _mean(player_loss_BT, weight_BT),
-        "player_accuracy": _mean(player_correct_BT, weight_BT),
-        "legal_loss": _mean(legal_loss_BT, played_BT),
-        "legal_accuracy": _mean(legal_correct_BT, played_BT),
+        "player_loss": masked_mean(player_loss_BT, weight_BT),
+        "player_accuracy": masked_mean(player_correct_BT, weight_BT),
+        "legal_loss": masked_mean(legal_loss_BT, played_BT),
+        "legal_accuracy": masked_mean(legal_correct_BT, played_BT),
     }
     none = jnp.zeros((), jnp.float32)
     metrics |= {"chance_loss": none, "chance_excess": none}
@@ -214,8 +216,8 @@ def turn_losses(logits_BT: TurnLogits, turn_BT: Turn, weight_BT: jax.Array) -> t
         target_BTC = turn_BT.chance_C
         chance_loss_BT = -(target_BTC * jax.nn.log_softmax(logits_BT.chance)).sum(-1)
         entropy_BT = jax.scipy.special.entr(target_BTC).sum(-1)
-        metrics["chance_loss"] = _mean(chance_loss_BT, chance_BT)
-        metrics["chance_excess"] = _mean(chance_loss_BT - entropy_BT, chance_BT)
+        metrics["chance_loss"] = masked_mean(chance_loss_BT, chance_BT)
+        metrics["chance_excess"] = masked_mean(chance_loss_BT - entropy_BT, chance_BT)
     return metrics["player_loss"] + metrics["legal_loss"] + metrics["chance_loss"], metrics
 
 
@@ -286,7 +288,7 @@ def _token_losses(
         if not model.token_size:
             return *cross_entropy(predicted, target), none
         distance = jnp.square(predicted - target).sum(-1)
-        return distance, (distance <= SAME_PATCH).astype(jnp.float32), none
+        return distance, (distance <= PATCH_THRESHOLD).astype(jnp.float32), none
 
     batch, tokens = target_BTL.shape[0], (*hidden_BTSD.shape[:2], model.block - 1)
     logits = math.prod(tokens[1:]) * model.observation_head.bias.shape[0]
@@ -307,8 +309,3 @@ def _weights(sequences: Sequences, mask_after_done: bool) -> tuple[jax.Array, ja
     ends_BT = jnp.cumsum(ended_BT.astype(jnp.int32), axis=1)
     before_BT = ends_BT - ended_BT.astype(jnp.int32)
     return (before_BT == 0).astype(jnp.float32), (ends_BT == 0).astype(jnp.float32)
-
-
-def _mean(value: jax.Array, weight: jax.Array) -> jax.Array:
-    """Weighted mean; 0 where nothing counts."""
-    return (value * weight).sum() / jnp.maximum(weight.sum(), 1)

@@ -168,7 +168,7 @@ class WorldModel(nnx.Module):
         rate = self.config.dropout
         embedding_key, layer_key = _split(dropout_key, 2)
         # All tokens along one axis: on a CPU, a bias's gradient, a sum over two axes, takes several times as long.
-        x = self._embed(tokens_BTL, action_BT, age_BTL).reshape(batch * steps * self.block, -1)
+        x = self.embed(tokens_BTL, action_BT, age_BTL).reshape(batch * steps * self.block, -1)
         position_SA = self._positions(jnp.arange(steps * self.block))
         graphdef, layers = nnx.split(self.layers)
 
@@ -262,13 +262,13 @@ class WorldModel(nnx.Module):
         self, cache: Cache, tokens_BL: jax.Array, action_B: jax.Array, age_BL: jax.Array | None = None
     ) -> tuple[Cache, jax.Array]:
         """Appends one block to the cache; its hidden states [B, S, D] equal those of the whole sequence's pass."""
-        return self._append(cache, self._embed(tokens_BL, action_B, age_BL))
+        return self._append(cache, self.embed(tokens_BL, action_B, age_BL))
 
     def remember(
         self, cache: Cache, tokens_BCL: jax.Array, action_BC: jax.Array, age_BCL: jax.Array | None = None
     ) -> Cache:
         """Appends C blocks to the cache, all at once."""
-        x_BCSD = self._embed(tokens_BCL, action_BC, age_BCL)
+        x_BCSD = self.embed(tokens_BCL, action_BC, age_BCL)
         cache, _ = self._append(cache, x_BCSD.reshape(len(x_BCSD), -1, x_BCSD.shape[-1]))
         return cache
 
@@ -317,7 +317,7 @@ class WorldModel(nnx.Module):
             return None
         return jax.lax.stop_gradient(self.contents[...]) @ reading[...]
 
-    def _embed(self, tokens: jax.Array, action: jax.Array, age: jax.Array | None) -> jax.Array:
+    def embed(self, tokens: jax.Array, action: jax.Array, age: jax.Array | None) -> jax.Array:
         if self.codes_per_place:
             places = self.codes_per_place * jnp.arange(tokens.shape[-1])
             tokens = tokens + places.reshape((1,) * (tokens.ndim - 1) + (-1,))

@@ -74,7 +74,7 @@ def test_it_learns_what_each_action_led_to(agent):
     tokenizer, _ = agent.update_tokenizer(state.tokenizer, replay, jax.random.key(3))
     bright_K = agent.tokenizer.contents(tokenizer).mean(-1) > 0.5
     keys = jax.random.split(jax.random.key(2), 32)
-    shown = jax.jit(jax.vmap(lambda key: agent._replayed(tokenizer, replay, key)))(keys)
+    shown = jax.jit(jax.vmap(lambda key: agent.replayed_sequences(tokenizer, replay, key)))(keys)
     position_BT = np.argmax(bright_K[shown.tokens_BTL], axis=-1)  # B: 32 minibatches of sequences
     before_BT, after_BT = position_BT[..., :-1], position_BT[..., 1:]
     arrives_BT = (before_BT == 2) & (shown.action_BT == 1)
@@ -97,7 +97,7 @@ def test_the_newest_steps_measure_a_model_that_has_not_learned_from_them(agent):
     contents_KP = agent.tokenizer.contents(tokenizer)
     assert np.asarray(contents_KP).any()
     model_state, expected = state.world_model, jnp.zeros(3)
-    measure = jax.jit(agent._measure)
+    measure = jax.jit(agent.measure_rewards)
     for key in jax.random.split(jax.random.key(2), 2):
         now = measure(model_state.with_contents(contents_KP).dreaming, tokenizer, replay, jax.random.fold_in(key, 0))
         np.testing.assert_array_equal(now[1:], [0, 1])

@@ -7,8 +7,8 @@ import pytest
 from suite import registry
 from suite.benchmarks import comparisons, phases
 from suite.runtime.reporting import QuietReporter
-from tests.interface.test_host import Walks
 from tests.tiny import CORRIDOR
+from tests.walks import Walks
 
 
 def test_every_phase_is_measured_and_projected(monkeypatch):

@@ -148,8 +148,9 @@ def test_a_run_folder_that_cannot_be_read(suite, never, folder, content, message
 def test_a_run_folder_in_use(suite, folder):
     with RunRecord.open(folder):
         code, _, err = suite("run", *SMOKE)
-        assert code == 2 and f"{folder} is in use by another process (pid {os.getpid()}" in err
-        refused(suite("evaluate", folder), "in use by another process")
+        assert code == 75 and f"{folder} is in use by another process (pid {os.getpid()}" in err
+        code, _, err = suite("evaluate", folder)
+        assert code == 75 and "in use by another process" in err
 
 
 def test_evaluating_without_a_checkpoint(suite, folder):

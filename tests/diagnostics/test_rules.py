@@ -15,7 +15,7 @@ from suite.runs import training
 from suite.runtime.errors import UserError
 from suite.runtime.reporting import QuietReporter
 from tests.tiny import CORRIDOR, PENNIES
-from tests.world_model.test_games import learned
+from tests.world_model.pennies import learned
 
 EVENTS = ("legal", "player", "legal_set", "observations", "reward", "terminated")
 
@@ -43,11 +43,11 @@ def test_a_model_that_knows_the_rules_and_one_that_knows_nothing(uniform):
 def test_chance_that_does_as_it_should_and_chance_that_does_not():
     odds = np.tile([0.5, 0.3, 0.2, 0.0], (4000, 1))
     fair = np.random.default_rng(0).choice(4, 4000, p=odds[0])
-    assert rules._largest_z(fair, odds) < 4
-    assert rules._largest_z(np.where(np.arange(4000) % 10 == 0, 2, fair), odds) > 8
+    assert rules.largest_z(fair, odds) < 4
+    assert rules.largest_z(np.where(np.arange(4000) % 10 == 0, 2, fair), odds) > 8
     by_hand = np.array([0] * 60 + [1] * 40)
-    assert rules._largest_z(by_hand, np.full((100, 2), 0.5)) == pytest.approx(2)  # 10 too many, deviation 5
-    assert math.isnan(rules._largest_z(np.full(10, -1), np.zeros((10, 2))))  # nowhere did chance act
+    assert rules.largest_z(by_hand, np.full((100, 2), 0.5)) == pytest.approx(2)  # 10 too many, deviation 5
+    assert math.isnan(rules.largest_z(np.full(10, -1), np.zeros((10, 2))))  # nowhere did chance act
 
 
 def test_of_a_run(tmp_path, monkeypatch):

@@ -81,10 +81,10 @@ def test_a_published_level_is_a_line_where_budgets_agree(made, tmp_path):
     entries = [s.entry for s in standings if s.entry.config.task == "minatar/breakout"]
     entries = [entry for entry in entries if entry.config.preset == "small" and entry.config.agent == "mfrl"]
     theirs = (table["metric"] == "return") & ~table["measured_here"].astype(bool)
-    assert theirs.sum() > 1 and pages._panel(entries, table, "").published is None
+    assert theirs.sum() > 1 and pages.panel_of(entries, table, "").published is None
     table.loc[theirs, "steps"] = entries[0].config.protocol.steps
     best = table[theirs].sort_values("value").iloc[-1]
-    panel = pages._panel(entries, table, "")
+    panel = pages.panel_of(entries, table, "")
     assert panel.published == (best["method"], best["value"])
     told = [s.entry for s in standings if s.entry.config.agent in ("mfrl", "m6")]
     html = write_page(told, {"overall.csv": tables["overall.csv"], "minatar_breakout.csv": table}, tmp_path).read_text()

@@ -134,7 +134,7 @@ def test_the_table_fits_the_terminal():
     runs[0].end(Outcome("finished", result={"steps": 64, "seconds": 90.0, "scores": {"return": None}}))
     runs[20].status = "running"
     console = Console(file=io.StringIO(), width=100, color_system=None)
-    console.print(command._table(runs, True, 12))
+    console.print(command.status_table(runs, True, 12))
     lines = console.file.getvalue().splitlines()
     assert len(lines) < 12
     assert "return n/a" not in console.file.getvalue()  # what has ended gives way
@@ -160,10 +160,10 @@ def test_the_last_step_of_a_row_that_is_being_written(tmp_path):
 
 def test_what_runs_ask_of_ray():
     pytest.importorskip("ray")
-    from suite.runs.sweep_ray import _cpus, compute_types
+    from suite.runs.sweep_ray import compute_types, cpus_per_run
 
     asked = {((16, 4), None): 2, ((1, 1), None): 1, ((4, 4), 8): 1, ((8,), 3): 2, ((2,), 4): 0.5, ((0,), 3): 2}
-    assert {arguments: _cpus(*arguments) for arguments in asked} == asked
+    assert {arguments: cpus_per_run(*arguments) for arguments in asked} == asked
     # On CPUs or GPUs, whatever the machine is that asks.
     for gpus, kind in {0: "float32", 0.5: "bfloat16"}.items():
         (run,) = plan("minatar/breakout", "m5", [0], "smoke", compute_types(gpus))
@@ -220,7 +220,7 @@ def test_a_run_that_died_once(processed):
 
 
 def test_a_folder_in_use_is_waited_for(processed, monkeypatch):
-    in_use = "sys.stderr.write('error: f is in use by another process (pid 1 on n)\\n'); sys.exit(2)"
+    in_use = "sys.stderr.write('error: f is in use by another process (pid 1 on n)\\n'); sys.exit(75)"
     found, tries = processed(f"if tries < 4: {in_use}\n{RESULT}")
     assert (found.status, tries) == ("finished", 4)
     monkeypatch.setattr(sweep, "PATIENCE", 0.0)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.world_model.attention import _attend_cached, cached_attention, causal_attention, rope, token_positions
+from suite.world_model.attention import attend_cached, cached_attention, causal_attention, rope, token_positions
 
 
 def inputs(steps: int = 5, block: int = 7, heads: int = 2, width: int = 4) -> tuple[jax.Array, ...]:
@@ -78,7 +78,7 @@ def test_cached_attention_sees_only_what_is_filled():
         mixed = cached_attention(query[:, new], key.swapaxes(1, 2), value.swapaxes(1, 2), last_Q)
         np.testing.assert_allclose(mixed, masked_attention(query, key, value, 7)[:, new], atol=1e-6)
         # On other devices all streams at once.
-        together = _attend_cached(query[:, new], key.swapaxes(1, 2), value.swapaxes(1, 2), last_Q)
+        together = attend_cached(query[:, new], key.swapaxes(1, 2), value.swapaxes(1, 2), last_Q)
         np.testing.assert_allclose(together, mixed, atol=1e-6)
 
 

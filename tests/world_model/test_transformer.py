@@ -31,12 +31,12 @@ def test_parameter_counts(codes, total):
 def test_block_causality_by_gradients(positions):
     """A prediction depends on every token and the action of its own frame and of earlier ones; on nothing later."""
     model = small_model(std=0.2, positions=positions)
-    embedding_BTSD = model._embed(TOKENS, ACTION, None)
+    embedding_BTSD = model.embed(TOKENS, ACTION, None)
     time = 2
 
     def prediction(embedding, readout):
         seen = small_model(std=0.2, positions=positions)
-        seen._embed = lambda tokens, action, age: embedding
+        seen.embed = lambda tokens, action, age: embedding
         return readout(seen, seen(TOKENS, ACTION))
 
     readouts = [
@@ -54,11 +54,11 @@ def test_block_causality_by_gradients(positions):
 def test_causality_without_block_teacher_forcing():
     """The output at a token sees that token and those before it; logits are read where fidelity note 19 says."""
     model = small_model(std=0.2, block_teacher_forcing=False)
-    embedding_BTSD = model._embed(TOKENS, ACTION, None)
+    embedding_BTSD = model.embed(TOKENS, ACTION, None)
 
     def prediction(embedding, readout):
         seen = small_model(std=0.2, block_teacher_forcing=False)
-        seen._embed = lambda tokens, action, age: embedding
+        seen.embed = lambda tokens, action, age: embedding
         return readout(seen, seen(TOKENS, ACTION))
 
     def seen_by(readout):

@@ -11,7 +11,7 @@ from adapters.craftax.classic_renderer import ITEMS, NEEDS
 from adapters.craftax.symbols import ARROW, PLAYER, VALUES, classic_symbols
 from adapters.numerics import loose_numerics
 from suite import registry
-from tests.adapters.craftax.test_classic_renderer import arbitrary_state
+from tests.adapters.craftax.worlds import arbitrary_state
 
 BLOCKS, CREATURES, COUNTS = slice(0, 63), slice(63, 126), slice(126, 142)
 FACING, ASLEEP, DAYLIGHT = 142, 143, 144

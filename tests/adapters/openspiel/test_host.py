@@ -20,7 +20,7 @@ from suite.runs import training
 from suite.runtime.errors import RunError, UserError
 from suite.runtime.reporting import QuietReporter
 from tests import games
-from tests.adapters.pettingzoo.test_pettingzoo import check
+from tests.adapters.pettingzoo.standard import check
 from tests.contract import check_environment
 
 SMALL = ["tic_tac_toe", "leduc", "kuhn_poker"]
@@ -34,7 +34,7 @@ def engine(name):
 def hosted(name):
     """A game as if it were too large, whether it is or not; the specification of a small one is its tables'."""
     return openspiel_host.make(
-        engine(name), games.game(name).spec if name in SMALL else openspiel._measure_by_play(name)
+        engine(name), games.game(name).spec if name in SMALL else openspiel.measured_by_play(name)
     )
 
 
@@ -83,10 +83,10 @@ def test_pettingzoo_has_them_too():
     ],
 )
 def test_what_random_play_measures(name, high, rewards):
-    spec = openspiel._measure_by_play(name)
+    spec = openspiel.measured_by_play(name)
     assert (spec.observation.high, spec.reward_classes) == (high, rewards)
-    if openspiel._canonical(name) in SMALL:
-        tabled = games.game(openspiel._canonical(name)).spec
+    if openspiel.canonical_name(name) in SMALL:
+        tabled = games.game(openspiel.canonical_name(name)).spec
         assert spec.observation.shape == tabled.observation.shape
         assert (spec.num_actions, spec.chance_outcomes) == (tabled.num_actions, tabled.chance_outcomes)
 

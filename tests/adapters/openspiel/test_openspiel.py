@@ -36,7 +36,7 @@ def test_the_specification_is_the_engines(name):
     assert spec.observation.shape == (np.prod(game.observation_tensor_shape()),)
     assert spec.observation.high == tables.observation_2NO.max()
     assert len(tables.player_N) == SIZES[name]
-    measured = openspiel._measure(name, tables)
+    measured = openspiel.measured(name, tables)
     if name == "leduc":  # learned from the sign of -13..13
         assert (measured.reward_classes[0], measured.reward_classes[-1]) == (-13, 13)
         measured = dataclasses.replace(measured, reward_classes=(-1.0, 0.0, 1.0))
@@ -242,7 +242,7 @@ def test_the_cache(tmp_path, monkeypatch):
     ):
         path.write_bytes(broken)
         assert_equal(openspiel.walked("leduc"), built)
-        assert_equal(openspiel._read(path), built)
+        assert_equal(openspiel.read_tables(path), built)
         assert [path] == list((tmp_path / "openspiel").iterdir())
 
 

@@ -16,26 +16,18 @@ from suite import registry
 from suite.interface.batching import Batched
 from suite.interface.turns import choose_event
 from suite.runtime.errors import UserError
+from tests.adapters.pettingzoo.standard import check
 from tests.contract import check_environment
 from tests.tiny import Corridor, Pennies
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)  # it makes environments in its own old way
-    from pettingzoo.test import api_test, seed_test
 
 PENNIES = Pennies()
 EXPORTED = sorted(id for id, task in registry.tasks().items() if task.family == "openspiel")
 
 
 # Out.
-
-
-def check(task):
-    with warnings.catch_warnings():
-        # It knows by name which games observe a dictionary; a mask or an observation may be all zeros.
-        warnings.filterwarnings("ignore", ".*should be gymnasium.spaces.box or|.*not a NumPy array|.*is all zeros")
-        api_test(export.env(task, render_mode="ansi"), num_cycles=20)
-    seed_test(lambda: export.env(task), num_cycles=10)
 
 
 def test_standard_tests_of_a_tiny_game():
