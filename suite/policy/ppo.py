@@ -191,7 +191,7 @@ class PolicyTrainState:
 
     @classmethod
     def create(cls, ppo: PPOConfig, optimizer: optax.GradientTransformation, params: nnx.State) -> PolicyTrainState:
-        """A fresh policy_state of `params`, the state of `nnx.split(policy)`."""
+        """That of a policy that has learned nothing yet; `params` is the state of `nnx.split(policy)`."""
         return cls(
             params,
             optimizer.init(params),
@@ -226,7 +226,7 @@ def update(
     With `remaining`, float32 shares of the budget that are left before and after these updates, the learning rate
     falls from the first to the second share of itself, linearly by minibatch (note 11).
 
-    Each minibatch runs the network over all T steps again, from `trajectory.hidden_BH`. Returns the policy_state and
+    Each minibatch runs the network over all T steps again, from `trajectory.hidden_BH`. Returns the new state and
     the float32 scalars that `METRICS` names, those of the loss averaged over all minibatch updates. Raises
     ValueError if `minibatches` does not divide B.
     """
