@@ -46,7 +46,7 @@ class Result:
     steps: int
     wall_seconds: float
     scores: dict[str, float]
-    evaluation: dict[str, float]
+    evaluation: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
 def run(config: Config, out: Path, reporter: Reporter, resume: bool = False) -> Result:

@@ -172,7 +172,7 @@ def test_another_process_is_refused_and_a_dead_one_is_not(tmp_path):
         )
         command = [sys.executable, "-c", code, str(record.folder)]
         output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        assert output.startswith(f"UserError {record.folder} is in use by another process (pid ")
+        assert output.startswith(f"FolderInUseError {record.folder} is in use by another process (pid ")
         RunRecord.open(record.folder, lock=False)  # reading is free
     subprocess.run(command, capture_output=True, check=True)  # takes the lock, and dies with it
     RunRecord.open(record.folder, CONFIG).close()

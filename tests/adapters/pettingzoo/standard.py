@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import warnings
 
-from pettingzoo.test import api_test, seed_test
-
 from adapters.pettingzoo import export
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore", DeprecationWarning)  # it makes environments in its own old way
+    from pettingzoo.test import api_test, seed_test
 
 
 def check(task):

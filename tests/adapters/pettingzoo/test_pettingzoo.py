@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import warnings
-
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -19,9 +17,6 @@ from suite.runtime.errors import UserError
 from tests.adapters.pettingzoo.standard import check
 from tests.contract import check_environment
 from tests.tiny import Corridor, Pennies
-
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", DeprecationWarning)  # it makes environments in its own old way
 
 PENNIES = Pennies()
 EXPORTED = sorted(id for id, task in registry.tasks().items() if task.family == "openspiel")
