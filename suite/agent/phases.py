@@ -32,6 +32,7 @@ from suite.tokenizers.stream import build_tokenizer
 from suite.world_model import training as world_model_training
 from suite.world_model.ages import ages_of
 from suite.world_model.imagination import Dream, Past
+from suite.world_model.sequences import Sequences
 from suite.world_model.transformer import WorldModel
 
 Metrics = dict[str, jax.Array]
@@ -239,7 +240,7 @@ class Agent:
 
     def replayed_sequences(
         self, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array, recent: int = 0
-    ) -> world_model_training.Sequences:
+    ) -> Sequences:
         """A minibatch of replayed sequences of T_WM + 1 frames; with `recent`, of those that ended so lately."""
         config = self.config.world_model
         length = self.ages + config.sequence_length + 1
@@ -248,7 +249,7 @@ class Agent:
         age_BTL = ages_of(tokens_BTL, self.ages) if self.ages else None
         batch, tokens_BTL, age_BTL = jax.tree.map(lambda x: x[:, self.ages :], (batch, tokens_BTL, age_BTL))
         action_BT = batch.action if batch.turn is None else stream_action(batch.turn, batch.action)
-        return world_model_training.Sequences(
+        return Sequences(
             tokens_BTL=tokens_BTL,
             action_BT=action_BT[:, :-1],
             reward_BT=batch.reward[:, :-1],

@@ -15,7 +15,7 @@ Shapes: B streams, T time steps, L tokens per frame, S = L + 1 tokens per block,
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -23,10 +23,24 @@ from flax import struct
 
 from suite.nn.sampling import draw
 from suite.world_model.heads import filled_odds
+from suite.world_model.sequences import Sequences
 
-if TYPE_CHECKING:
-    from suite.world_model.training import Sequences
-    from suite.world_model.transformer import Cache, WorldModel
+Cache = Any  # A model's own pytree of arrays: what it remembers of the blocks before.
+
+
+class Predictor(Protocol):
+    """What sampling asks of a world model (`suite.world_model.transformer.WorldModel`, where it is explained)."""
+
+    block: int
+    token_size: int
+
+    def observation_logits(self, hidden: jax.Array) -> jax.Array: ...
+
+    def code_logits(self, hidden: jax.Array) -> jax.Array: ...
+
+    def token_odds(self, hidden_BSD: jax.Array, tokens_BL: jax.Array, valid_K: jax.Array) -> jax.Array: ...
+
+    def append_token(self, cache: Cache, token_B: jax.Array, place: jax.Array) -> tuple[Cache, jax.Array]: ...
 
 
 @struct.dataclass
@@ -76,7 +90,7 @@ class Factorization(Protocol):
     def sample(
         self,
         key: jax.Array,
-        model: WorldModel,
+        model: Predictor,
         cache: Cache,
         hidden_BSD: jax.Array,
         tokens_BL: jax.Array,
@@ -127,7 +141,7 @@ class BlockParallel:
     def sample(
         self,
         key: jax.Array,
-        model: WorldModel,
+        model: Predictor,
         cache: Cache,
         hidden_BSD: jax.Array,
         tokens_BL: jax.Array,
@@ -178,7 +192,7 @@ class TokenByToken:
     def sample(
         self,
         key: jax.Array,
-        model: WorldModel,
+        model: Predictor,
         cache: Cache,
         hidden_BSD: jax.Array,
         tokens_BL: jax.Array,
@@ -195,7 +209,7 @@ def factorization(block_teacher_forcing: bool) -> Factorization:
 
 
 def sample_one_by_one(
-    key: jax.Array, model: WorldModel, cache: Cache, action_hidden_BD: jax.Array, valid_K: jax.Array
+    key: jax.Array, model: Predictor, cache: Cache, action_hidden_BD: jax.Array, valid_K: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """The next frame's tokens, int32 [B, L], each given those before it, and their log-probabilities [B, L] (Eq. 2).
 

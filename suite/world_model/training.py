@@ -18,6 +18,7 @@ from suite.nn.masked import masked_mean
 from suite.nn.optimizer import clipped
 from suite.world_model.correspondence import mixture_loss
 from suite.world_model.heads import TurnLogits
+from suite.world_model.sequences import Sequences
 from suite.world_model.transformer import WorldModel
 
 CHUNK_LOGITS = 2**25  # observation logits held at once: 128 MiB
@@ -39,29 +40,6 @@ TURN_METRICS: tuple[str, ...] = (
     "chance_loss",
     "chance_excess",
 )  # in a two-player game besides
-
-
-@struct.dataclass
-class Sequences:
-    """B replayed sequences of T steps and T + 1 frames, their observations as tokens.
-
-    Attributes:
-      tokens_BTL: int32 [B, T + 1, L], or float32 [B, T + 1, L, P] where tokens are vectors.
-      action_BT: int32; taken at frame t.
-      reward_BT: float32; what it earned.
-      terminated_BT: bool; the episode ended there, and frame t + 1 belongs to the next one.
-      ended_BT: bool; terminated or truncated; None: terminated. Only `mask_after_done` looks at it.
-      turn_BT: whose turn it is at each of the T + 1 frames; None for single-agent tasks.
-      age_BTL: int32 [B, T, L]; ages of all tokens but the last frame's, for a model that is told them; else None.
-    """
-
-    tokens_BTL: jax.Array
-    action_BT: jax.Array
-    reward_BT: jax.Array
-    terminated_BT: jax.Array
-    ended_BT: jax.Array | None = None
-    turn_BT: Turn | None = None
-    age_BTL: jax.Array | None = None
 
 
 @struct.dataclass

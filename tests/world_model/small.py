@@ -9,7 +9,7 @@ from flax import nnx
 
 from suite.configuration.schema import WorldModelConfig
 from suite.interface.tokens import TokenSpec
-from suite.world_model.training import Sequences
+from suite.world_model.sequences import Sequences
 from suite.world_model.transformer import WorldModel
 
 SPEC = TokenSpec(tokens_per_frame=6, num_codes=8, num_actions=3, reward_classes=(0.0, 1.0))

@@ -15,6 +15,7 @@ from suite.nn.sampling import draw
 from suite.runtime.errors import UserError
 from suite.world_model import training
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_loss, mixture_odds, neighbourhood
+from suite.world_model.sequences import Sequences
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import small_config
 
@@ -85,9 +86,9 @@ def model_of(seed: int = 0, **changes) -> WorldModel:
     return WorldModel(small_config(**changes), TOKENS, GRID, nnx.Rngs(seed))
 
 
-def sequences(batch: int = 2, steps: int = 3) -> training.Sequences:
+def sequences(batch: int = 2, steps: int = 3) -> Sequences:
     keys = jax.random.split(jax.random.key(7), 4)
-    return training.Sequences(
+    return Sequences(
         tokens_BTL=jax.random.randint(keys[0], (batch, steps + 1, PLACES), 0, CODES),
         action_BT=jax.random.randint(keys[1], (batch, steps), 0, 3),
         reward_BT=jax.random.bernoulli(keys[2], 0.3, (batch, steps)).astype(jnp.float32),
@@ -147,7 +148,7 @@ def test_learning_to_shift():
         moved = jnp.pad(first[..., :-1], [(0, 0)] * 3 + [(1, 0)])
         none = jnp.zeros((16, 1))
         tokens = jnp.concatenate([first, moved], axis=1).reshape(16, 2, PLACES)
-        return training.Sequences(tokens, none.astype(jnp.int32), none, none.astype(bool))
+        return Sequences(tokens, none.astype(jnp.int32), none, none.astype(bool))
 
     def update(model_state, key):
         return training.update(config, optimizer, graph, spec, model_state, batch(key), key)

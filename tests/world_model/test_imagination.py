@@ -20,6 +20,7 @@ from suite.world_model import training
 from suite.world_model.ages import ages_of
 from suite.world_model.heads import filled_odds
 from suite.world_model.imagination import Dream, Past
+from suite.world_model.sequences import Sequences
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import SPEC, small_config, small_model
 
@@ -95,9 +96,7 @@ def learned() -> Learned:
                 return jax.lax.dynamic_slice_in_dim(x[:, index], start, length)
 
             terminated = cut(shown.terminated, HORIZON)
-            return training.Sequences(
-                cut(tokens, HORIZON + 1), cut(action, HORIZON), cut(shown.reward, HORIZON), terminated
-            )
+            return Sequences(cut(tokens, HORIZON + 1), cut(action, HORIZON), cut(shown.reward, HORIZON), terminated)
 
         return training.update(
             config, optimizer, graph, SPEC, model_state, jax.vmap(window)(starts, jnp.arange(32)), key
@@ -110,9 +109,7 @@ def learned() -> Learned:
 
     frames, action, shown = (jax.tree.map(lambda x: x[-HORIZON - 1 :], x) for x in real_play(seed=5, steps=200))
     tokens_BTL = tokenizer.encode(codes, frames).swapaxes(0, 1)
-    sequences = training.Sequences(
-        tokens_BTL, action[-HORIZON:].T, shown.reward[-HORIZON:].T, shown.terminated[-HORIZON:].T
-    )
+    sequences = Sequences(tokens_BTL, action[-HORIZON:].T, shown.reward[-HORIZON:].T, shown.terminated[-HORIZON:].T)
     metrics = jax.jit(lambda sequences: training.losses(model, sequences, config, SPEC)[1])(sequences)
     return Learned(model, tokenizer, codes, float(metrics["token_accuracy"]))
 
