@@ -7,7 +7,13 @@ import jax.numpy as jnp
 
 
 def masked_mean(x: jax.Array, mask: jax.Array | None = None) -> jax.Array:
-    """The mean of `x` where `mask`, of its shape, is true or 1 (None: everywhere); 0 of nothing."""
+    """The mean of `x` where `mask`, of its shape, counts; 0 of nothing.
+
+    Args:
+      x: float32.
+      mask: bool, or float32 weights; None: everything counts.
+    """
     if mask is None:
         return x.mean()
-    return jnp.where(mask.astype(bool), x, 0.0).sum() / jnp.maximum(mask.sum(dtype=x.dtype), 1.0)
+    counted = jnp.where(mask, x, 0.0) if mask.dtype == bool else x * mask
+    return counted.sum() / jnp.maximum(mask.sum().astype(x.dtype), 1.0)
