@@ -25,7 +25,6 @@ from suite.interface.environment import BatchedEnvironment, Environment
 from suite.interface.host import HostEnvironment
 from suite.interface.tokens import TokenSpec
 from suite.interface.turns import choose_event
-from suite.nn.fused_attention import fused_attention
 from suite.runtime.compilation import enable_compilation_cache
 from suite.world_model.attention import causal_attention
 from suite.world_model.block_teacher_forcing import factorization
@@ -193,6 +192,8 @@ def compare_attention(agent: Agent) -> Rows:
         "jax.nn.dot_product_attention": functools.partial(jax.nn.dot_product_attention, mask=visible_11QS),
     }
     if jax.default_backend() == "gpu":
+        from suite.nn.fused_attention import fused_attention
+
         ways["ours, fused kernel"] = functools.partial(fused_attention, unit=unit)
     times: dict[str, float] = {}
     for name, attend in ways.items():

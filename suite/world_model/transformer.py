@@ -11,6 +11,7 @@ tokens are no codes but vectors (`TokenSpec.token_size`), arrays of them have a 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,7 +23,6 @@ from jax.typing import DTypeLike
 from suite.configuration.schema import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.nn.dropout import dropout
-from suite.nn.fused_attention import fused_attention
 from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
 from suite.world_model.block_teacher_forcing import factorization
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
@@ -109,8 +109,11 @@ class WorldModel(nnx.Module):
         self.block = tokens.tokens_per_frame + 1
         self.factorization = factorization(config.block_teacher_forcing)
         self.unit = self.factorization.unit(self.block)
-        plain = functools.partial(causal_attention, block=self.block)
-        self._attend = fused_attention if config.attention == "fused" else plain
+        self._attend: Callable[..., jax.Array] = functools.partial(causal_attention, block=self.block)
+        if config.attention == "fused":  # only then is Pallas needed
+            from suite.nn.fused_attention import fused_attention
+
+            self._attend = fused_attention
         self.dtype = jnp.bfloat16 if config.compute_type == "bfloat16" else jnp.float32
         self.codes_per_place = tokens.num_codes if tokens.placed else 0
         codes = tokens.num_codes * (tokens.tokens_per_frame if tokens.placed else 1)

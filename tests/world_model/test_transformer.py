@@ -133,3 +133,8 @@ def test_seeds_can_be_a_leading_axis():
     for index in range(2):
         alone = nnx.merge(graph, params[index])(TOKENS, ACTION, jax.random.key(0))
         np.testing.assert_allclose(both[index], alone, atol=2e-5)
+
+
+def test_the_fused_kernel_gives_the_same_model():
+    plain, fused = (small_model(std=0.2, embed_dim=32, heads=2, attention=kind) for kind in ("plain", "fused"))
+    np.testing.assert_allclose(fused(TOKENS, ACTION), plain(TOKENS, ACTION), atol=1e-5)
