@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from suite.commands.configuration import add_configuration, parse_seeds
 from suite.commands.printing import device_name, make_reporter, print_json, print_scores, score_line
+from suite.interface.scores import ScoreName
 from suite.runtime.errors import UserError
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def _print_result(result: Result) -> None:
         print("already finished: nothing was run")
     print_scores(result.scores)
     if result.evaluation and not result.scores["episodes"]:
-        print(f"the final policy, over {result.evaluation['episodes']} whole episodes of evaluation:")
+        print(f"its newest evaluation, of {result.evaluation['episodes']} whole episodes:")
         print_scores(result.evaluation)
     print(f"record {result.folder}", flush=True)
 
@@ -102,5 +103,5 @@ def _summary(results: Sequence[Result]) -> dict[str, tuple[float, float]]:
     """Mean and standard error of each score; nan where they say nothing."""
     from leaderboards.statistics import mean_and_standard_error
 
-    names = [name for name in (results[0].scores if results else ()) if "/" not in name]
+    names = [name for name in (results[0].scores if results else ()) if not ScoreName(name).is_of_part]
     return {name: mean_and_standard_error(result.scores[name] for result in results) for name in names}
