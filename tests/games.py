@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import functools
-import tempfile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from adapters.openspiel import task as openspiel
 from adapters.openspiel.tables import Tables
@@ -18,10 +16,8 @@ from suite.interface.turns import choose_event
 
 @functools.cache
 def walked(name: str) -> Tables:
-    """From the engine, not from the user's cache folder."""
-    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SUITE_CACHE_DIR", folder)
-        return openspiel.walked(name)
+    """The game's tables, once for each process."""
+    return openspiel.walked(name)
 
 
 @functools.cache

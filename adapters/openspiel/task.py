@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import importlib.metadata
 import os
 import tempfile
@@ -36,8 +37,6 @@ from suite.runtime.errors import UserError, did_you_mean
 GAMES = {"tic_tac_toe": "tic_tac_toe", "leduc": "leduc_poker", "bargaining": "bargaining"}
 
 Progress = Callable[[str, float], None]
-
-_SCHEMA = 1  # of the files in the cache folder, and of what is too large for tables
 
 
 def _specification(
@@ -121,7 +120,7 @@ def _walked(name: str, progress: Progress | None) -> Tables | None:
     report = functools.partial(progress, message) if progress else lambda fraction: None
     report(0.0)
     version = importlib.metadata.version("open_spiel")
-    path = cache_dir() / "openspiel" / f"{name}-{version}-{_SCHEMA}.npz"
+    path = cache_dir() / "openspiel" / f"{name}-{version}-{_builder()}.npz"
     too_large = path.with_name(f"{path.stem}.too_large")  # an empty file
     tables = read_tables(path)
     if tables is None and not too_large.exists():
@@ -139,6 +138,12 @@ def _walked(name: str, progress: Progress | None) -> Tables | None:
             _write(path, tables)
     report(1.0)
     return tables
+
+
+@functools.cache
+def _builder() -> str:
+    """Tells versions of what builds tables apart, so that none of another version are read from the cache folder."""
+    return hashlib.sha256(Path(game_tables.__file__).read_bytes()).hexdigest()[:8]
 
 
 @struct.dataclass

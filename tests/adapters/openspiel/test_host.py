@@ -148,7 +148,7 @@ def test_that_a_game_is_too_large_is_remembered(small_tables, monkeypatch):
     spec = openspiel.spec("connect_four")
     assert spec == hosted("connect_four").spec
     (path,) = (small_tables / "openspiel").iterdir()
-    assert path.name.startswith("connect_four-") and path.name.endswith(f"-{openspiel._SCHEMA}.too_large")
+    assert path.name.startswith("connect_four-") and path.name.endswith(f"-{openspiel._builder()}.too_large")
 
     def walk(*_):
         raise AssertionError("walked again")

@@ -220,7 +220,7 @@ def test_the_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("SUITE_CACHE_DIR", str(tmp_path))
     built = openspiel.walked("leduc")
     (path,) = (tmp_path / "openspiel").iterdir()
-    assert path.name == f"leduc-{importlib.metadata.version('open_spiel')}-{openspiel._SCHEMA}.npz"
+    assert path.name == f"leduc-{importlib.metadata.version('open_spiel')}-{openspiel._builder()}.npz"
     whole = path.read_bytes()
 
     def walk(*_):
