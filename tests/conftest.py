@@ -11,6 +11,9 @@ os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
 import pytest
+from jax._src import compiler
+
+_compile_options = compiler.get_compile_options
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -60,16 +63,23 @@ def pytest_collection_modifyitems(items):
 
 
 # Tests of these run small programs for a moment, so that compiling them is most of the time. What is compiled as for
-# users is tested by the rest: games, whole commands in processes of their own, the page.
+# users is tested by the rest: every game of ours, and the runs that `.ci/run` makes after the tests.
 HASTY = (
+    "adapters/gymnasium",
+    "adapters/openspiel",
+    "adapters/pettingzoo",
     "agent",
     "baselines",
     "benchmarks",
+    "commands",
     "diagnostics",
     "interface",
+    "leaderboards",
     "nn",
     "policy",
-    "runs/test_training.py",
+    "runs",
+    "test_docs.py",
+    "test_gpu_script.py",
     "tokenizers",
     "world_model",
 )
@@ -77,11 +87,27 @@ HASTY = (
 
 @pytest.fixture(autouse=True, scope="module")
 def hasty_compilation(request):
-    """Compiles the programs of a module below `HASTY` without most optimizations, in half of the time."""
-    hasty = request.path.relative_to(Path(__file__).parent).as_posix().startswith(HASTY)
-    jax.config.update("jax_disable_most_optimizations", hasty)
-    yield
+    """Compiles the programs of a module below `HASTY` without most optimizations, in a third of the time."""
+    if not request.path.relative_to(Path(__file__).parent).as_posix().startswith(HASTY):
+        yield
+        return
+    jax.config.update("jax_disable_most_optimizations", True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # processes that the module starts
+        patch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false")
+        patch.setattr(compiler, "get_compile_options", _hasty_options)
+        yield
     jax.config.update("jax_disable_most_optimizations", False)
+
+
+def _hasty_options(*arguments, **options):
+    """JAX's compile options, and that XLA makes a CPU's loops in the old way, which takes half of the time.
+
+    JAX has no public setting for the options of all programs. Other devices than a CPU do not read this one.
+    """
+    found = _compile_options(*arguments, **options)
+    found.env_option_overrides = [*found.env_option_overrides, ("xla_cpu_use_fusion_emitters", False)]
+    return found
 
 
 @pytest.fixture
