@@ -51,8 +51,8 @@ def iterate(
       key: of its randomness.
       steps: real steps taken before it; an event of chance is none (note 32).
       call: runs each phase, `call(phase, function, *arguments)`, and returns what the function does, so that whoever
-        asks can time it and see its results. Phases are collect, remember, learn, tokenizer, world_model and imagine;
-        the last four also return their metrics.
+        asks can time it and see its results. Phases are collect, remember, learn, tokenizer, code, world_model and
+        imagine; learn, tokenizer, world_model and imagine also return their metrics.
       imagined_updates: how many there are after so many steps, given what share of new rewards the world model knew, if
         that is measured; None: as the configuration says.
 
@@ -80,7 +80,11 @@ def iterate(
     # Step 3: tokenizer and world model learn from replayed steps.
     known = None
     if world_model is not None:
+        lasting = agent.lasting_tokenizer is not None
+        codes = jnp.copy(tokenizer.count) if lasting and tokenizer is not None else None
         tokenizer, _ = call("tokenizer", agent.update_tokenizer, tokenizer, replay, tokenizer_key)
+        if lasting:
+            replay = call("code", agent.code, replay, tokenizer, codes)
         world_model, metrics = call("world_model", agent.update_world_model, world_model, tokenizer, replay, model_key)
         known = float(metrics["reward_known"]) if "reward_known" in metrics else None
 

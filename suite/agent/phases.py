@@ -28,6 +28,7 @@ from suite.interface.turns import Turn, stream_action
 from suite.policy import ppo
 from suite.policy.actor_critic import make_policy
 from suite.runtime.errors import UserError
+from suite.tokenizers.nearest_neighbor import NearestNeighborState, NearestNeighborTokenizer
 from suite.tokenizers.stream import build_tokenizer
 from suite.world_model import training as world_model_training
 from suite.world_model.ages import ages_of
@@ -129,7 +130,19 @@ class Agent:
 
     def new_replay(self) -> ReplayState:
         """An empty replay buffer, with room for the environments' states if dreams happen in the game."""
-        return self.replay.init(self.spec, self.kept_state)
+        lasting = self.lasting_tokenizer
+        return self.replay.init(self.spec, self.kept_state, lasting.tokens_per_frame if lasting else 0)
+
+    @property
+    def lasting_tokenizer(self) -> NearestNeighborTokenizer | None:
+        """The tokenizer, if the tokens of stored frames are kept; else None.
+
+        They are if its codes never change and a frame is one observation. A frame is sampled many times, and looking
+        its codes up each time takes a fifth of an iteration on Craftax.
+        """
+        if not self.config.world_model.enabled or self.spec.two_player:
+            return None
+        return self.tokenizer if isinstance(self.tokenizer, NearestNeighborTokenizer) else None
 
     @property
     def kept_state(self) -> State:
@@ -195,6 +208,20 @@ class Agent:
         return tokenizer, {name: values[-1] for name, values in metrics.items()}
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    def code(self, replay: ReplayState, tokenizer: NearestNeighborState, known: jax.Array) -> ReplayState:
+        """Brings the tokens of stored frames up to date, where they are kept.
+
+        Args:
+          replay: the buffer, an iteration's new frames in it.
+          tokenizer: after it has learned.
+          known: int32 scalar; how many codes it had before that.
+        """
+        assert self.lasting_tokenizer is not None
+        return self.replay.code(
+            replay, self.lasting_tokenizer, tokenizer, known, self.config.environment.rollout_length
+        )
+
+    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def update_world_model(
         self,
         model_state: world_model_training.WorldModelTrainState,
@@ -245,7 +272,10 @@ class Agent:
         config = self.config.world_model
         length = self.ages + config.sequence_length + 1
         batch = self.replay.sample(replay, key, config.sequences // config.minibatches, length, recent)
-        tokens_BTL = encode_frame(self.tokenizer, tokenizer, batch.observation, batch.turn)
+        coded = batch.coded
+        tokens_BTL = (
+            encode_frame(self.tokenizer, tokenizer, batch.observation, batch.turn) if coded is None else coded.tokens
+        )
         age_BTL = ages_of(tokens_BTL, self.ages) if self.ages else None
         batch, tokens_BTL, age_BTL = jax.tree.map(lambda x: x[:, self.ages :], (batch, tokens_BTL, age_BTL))
         action_BT = batch.action if batch.turn is None else stream_action(batch.turn, batch.action)
@@ -347,8 +377,9 @@ class Agent:
             game = Batched(self.batched.environment, plan.num_envs)
             return game.resumed(start.state, start.observation, start.first, start.turn)
         before = jax.tree.map(lambda x: x[len(past.first) - 1 - self.past : -1], past)
-        known = Past(before.observation, before.action, before.turn) if self.past else None
-        return self.dream_from(model, tokenizer, start.observation, start.turn, plan.horizon, known)
+        past_PBL, start_BL = (None if x.coded is None else x.coded.tokens for x in (before, start))
+        known = Past(before.observation, before.action, before.turn, past_PBL) if self.past else None
+        return self.dream_from(model, tokenizer, start.observation, start.turn, plan.horizon, known, start_BL)
 
     def dream_from(
         self,
@@ -358,6 +389,7 @@ class Agent:
         turn_B: Turn | None,
         horizon: int,
         past: Past | None = None,
+        tokens_BL: jax.Array | None = None,
     ) -> Dream:
         """The world model as an environment that starts at these frames (Algorithm 4).
 
@@ -367,6 +399,7 @@ class Agent:
           turn_B: whose turn it is there, in a game of two players.
           horizon: steps that it can take.
           past: the `self.past` real frames before these, if there are some to be told of.
+          tokens_BL: the frames' tokens, if they are known.
         """
         plan = self.config.imagination
         return Dream(
@@ -379,6 +412,7 @@ class Agent:
             observation_BO,
             turn_B,
             past=past,
+            start_tokens_BL=tokens_BL,
             context=plan.context,
             min_p=plan.min_p,
         )

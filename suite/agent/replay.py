@@ -18,8 +18,17 @@ from suite.configuration.schema import Config
 from suite.interface.environment import EnvironmentSpec, State
 from suite.interface.turns import Turn
 from suite.policy.ppo import Trajectory
+from suite.tokenizers.nearest_neighbor import NearestNeighborState, NearestNeighborTokenizer
 
 ReplayState = Any  # flashbax's TrajectoryBufferState
+
+
+@struct.dataclass
+class Coded:
+    """A stored frame's tokens, int32 [..., L], and how far each patch is from its code, float32 [..., L]."""
+
+    tokens: jax.Array
+    distance: jax.Array
 
 
 @struct.dataclass
@@ -34,6 +43,7 @@ class Experience:
       first: bool; the frame opens an episode.
       turn: whose move it was and what was allowed; None for single-agent tasks.
       state: the environment's own state at the frame, for agents that dream in the true game; else None.
+      coded: the frame's tokens, where those of a stored frame are kept (`Replay.code`); else None.
     """
 
     observation: jax.Array
@@ -43,6 +53,7 @@ class Experience:
     first: jax.Array
     turn: Turn | None = None
     state: State = None
+    coded: Coded | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,8 +79,14 @@ class Replay:
             max_length_time_axis=self.length,
         )
 
-    def init(self, spec: EnvironmentSpec, state: State = None) -> ReplayState:
-        """An empty buffer; `state`: the shapes of one environment's state, where states are kept."""
+    def init(self, spec: EnvironmentSpec, state: State = None, tokens: int = 0) -> ReplayState:
+        """An empty buffer.
+
+        Args:
+          spec: the task's.
+          state: the shapes of one environment's state, where states are kept.
+          tokens: L, where the tokens of frames are kept; else 0.
+        """
         step = Experience(
             observation=jnp.zeros(spec.observation.shape, jnp.uint8),
             action=jnp.zeros((), jnp.int32),
@@ -78,12 +95,14 @@ class Replay:
             first=jnp.zeros((), bool),
             turn=_no_turn(spec) if spec.two_player else None,
             state=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state),
+            coded=_uncoded((tokens,)) if tokens else None,
         )
         # flashbax counts with Python's numbers, whose weak types a restored buffer does not have: another program each.
         return jax.tree.map(lambda x: x.astype(x.dtype), self._buffer(1, 1).init(step))
 
     def add(self, state: ReplayState, trajectory: Trajectory) -> ReplayState:
-        """Appends a trajectory (time-major, [T, B]); the oldest steps give way."""
+        """Appends a trajectory (time-major, [T, B]); the oldest steps give way. Its frames have no tokens yet."""
+        kept = state.experience.coded
         experience = Experience(
             observation=trajectory.observation_TB,
             action=trajectory.action_TB,
@@ -92,8 +111,42 @@ class Replay:
             first=trajectory.first_TB,
             turn=trajectory.turn_TB,
             state=trajectory.state_TB,
+            coded=None if kept is None else _uncoded((*trajectory.action_TB.shape, kept.tokens.shape[-1])),
         )
         return self._buffer(1, 1).add(state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), experience))
+
+    def code(
+        self,
+        state: ReplayState,
+        tokenizer: NearestNeighborTokenizer,
+        codebook: NearestNeighborState,
+        known: jax.Array,
+        new: int,
+    ) -> ReplayState:
+        """Brings the tokens of stored frames up to date: what `tokenizer.encode` says of every frame now.
+
+        Args:
+          state: a buffer with tokens.
+          tokenizer: whose codes never change, so that old frames need only be compared with new codes.
+          codebook: its state now.
+          known: int32 scalar; how many codes it had when all but the newest frames were coded last.
+          new: so many of the latest steps of each environment have no tokens yet.
+        """
+        frames, coded = state.experience.observation, state.experience.coded
+
+        def recode(slot: jax.Array, coded: Coded) -> Coded:
+            tokens, distance = coded.tokens[:, slot], coded.distance[:, slot]
+            nearer = tokenizer.nearer(codebook, known, frames[:, slot], tokens, distance)
+            return _written(coded, slot, *nearer)
+
+        def code(i: jax.Array, coded: Coded) -> Coded:
+            slot = (state.current_index - 1 - i) % self.length
+            return _written(coded, slot, *tokenizer.nearest(codebook, frames[:, slot]))
+
+        stored = jnp.where(state.is_full, self.length, state.current_index)
+        coded = jax.lax.fori_loop(0, jnp.where(codebook.count > known, stored, 0), recode, coded)
+        coded = jax.lax.fori_loop(0, new, code, coded)
+        return state.replace(experience=state.experience.replace(coded=coded))
 
     def sample(self, state: ReplayState, key: jax.Array, batch: int, length: int, recent: int = 0) -> Experience:
         """`batch` sequences of `length` consecutive steps; leading axes [batch, length].
@@ -114,6 +167,15 @@ class Replay:
         first_N = state.current_index - length - age_N
         time_NT = (first_N[:, None] + jnp.arange(length)[None]) % self.length
         return jax.tree.map(lambda x: x[row_N[:, None], time_NT], state.experience)
+
+
+def _uncoded(shape: tuple[int, ...]) -> Coded:
+    """Tokens of frames that were never looked at: every code is nearer than theirs."""
+    return Coded(jnp.zeros(shape, jnp.int32), jnp.full(shape, jnp.inf, jnp.float32))
+
+
+def _written(coded: Coded, slot: jax.Array, tokens: jax.Array, distance: jax.Array) -> Coded:
+    return Coded(coded.tokens.at[:, slot].set(tokens), coded.distance.at[:, slot].set(distance))
 
 
 def _no_turn(spec: EnvironmentSpec) -> Turn:

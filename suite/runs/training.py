@@ -25,6 +25,7 @@ from suite.runtime.errors import RunError, UserError, host_errors
 from suite.runtime.reporting import Reporter
 from suite.runtime.signals import stop_signals
 
+PART_OF = {"remember": "collect", "code": "tokenizer"}  # phases without metrics, which are not timed by themselves
 PHASES = ("start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint")
 
 
@@ -157,9 +158,9 @@ class _Training:
 
     def _call(self, phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Runs and times a phase; keeps its metrics and, of real play, the episodes."""
-        if phase == "remember":  # the end of collecting, and nothing to wait for
-            with self._timed("collect"):
-                return function(*arguments)
+        if phase in PART_OF:
+            with self._timed(PART_OF[phase]):
+                return jax.block_until_ready(function(*arguments))
         with self._phase(phase):
             result = function(*arguments)
             if phase == "collect":

@@ -37,11 +37,13 @@ class Past:
       observation_PBO: uint8.
       action_PB: int32, taken on them, in the player's own numbering.
       turn_PB: whose turns they were; None for single-agent tasks.
+      tokens_PBL: the frames' tokens, if they are known.
     """
 
     observation_PBO: jax.Array
     action_PB: jax.Array
     turn_PB: Turn | None = None
+    tokens_PBL: jax.Array | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Dream:
       horizon: T_WM, steps.
       start_observation_BO: uint8; real frames. Callers that know what came before them burn the policy's memory in.
       start_turn_B: whose turn it is there; None for single-agent tasks.
+      start_tokens_BL: their tokens, if they are known.
       past: real steps before them, at least as many as the context and, to tell ages by, as the model's highest age.
       context: how many of the last of these the model reads; 0: its view begins with the start frames (note 24).
       min_p: codes less likely than this share of the likeliest are not drawn.
@@ -74,6 +77,7 @@ class Dream:
     horizon: int
     start_observation_BO: jax.Array
     start_turn_B: Turn | None = None
+    start_tokens_BL: jax.Array | None = None
     past: Past | None = None
     context: int = 0
     min_p: float = 0.0
@@ -87,7 +91,9 @@ class Dream:
         """The start frames as they are, `first` false; `key` is not used."""
         del key
         turn_B = self.start_turn_B
-        tokens_BL = encode_frame(self.tokenizer, self.tokenizer_state, self.start_observation_BO, turn_B)
+        tokens_BL = self.start_tokens_BL
+        if tokens_BL is None:
+            tokens_BL = encode_frame(self.tokenizer, self.tokenizer_state, self.start_observation_BO, turn_B)
         never_B = jnp.zeros((self.num_envs,), bool)
         cache, age_BL = self._remember(tokens_BL)
         time_step = _time_step(self.start_observation_BO, jnp.zeros((self.num_envs,), jnp.float32), never_B, turn_B)
@@ -99,7 +105,9 @@ class Dream:
         if self.past is None:
             return cache, None
         turn_PB, action_PB = self.past.turn_PB, self.past.action_PB
-        tokens_PBL = encode_frame(self.tokenizer, self.tokenizer_state, self.past.observation_PBO, turn_PB)
+        tokens_PBL = self.past.tokens_PBL
+        if tokens_PBL is None:
+            tokens_PBL = encode_frame(self.tokenizer, self.tokenizer_state, self.past.observation_PBO, turn_PB)
         if turn_PB is not None:
             action_PB = stream_action(turn_PB, action_PB)
         tokens_BPL, action_BP, age_BPL = tokens_PBL.swapaxes(0, 1), action_PB.swapaxes(0, 1), None

@@ -72,6 +72,7 @@ def test_it_learns_what_each_action_led_to(agent):
     for trajectory in trajectories:
         replay = agent.remember(replay, trajectory)
     tokenizer, _ = agent.update_tokenizer(state.tokenizer, replay, jax.random.key(3))
+    replay = agent.code(replay, tokenizer, jnp.int32(0))
     bright_K = agent.tokenizer.contents(tokenizer).mean(-1) > 0.5
     keys = jax.random.split(jax.random.key(2), 32)
     shown = jax.jit(jax.vmap(lambda key: agent.replayed_sequences(tokenizer, replay, key)))(keys)
@@ -94,6 +95,7 @@ def test_the_newest_steps_measure_a_model_that_has_not_learned_from_them(agent):
         paid = dataclasses.replace(trajectory, reward_TB=jnp.full_like(trajectory.reward_TB, reward))
         replay = agent.remember(replay, paid)
     tokenizer, _ = agent.update_tokenizer(state.tokenizer, replay, jax.random.key(3))
+    replay = agent.code(replay, tokenizer, jnp.int32(0))
     contents_KP = agent.tokenizer.contents(tokenizer)
     assert np.asarray(contents_KP).any()
     model_state, expected = state.world_model, jnp.zeros(3)

@@ -18,7 +18,7 @@ def test_every_phase_is_measured_and_projected(monkeypatch):
     config = registry.resolve("corridor", "m5", "smoke")
     report = phases.bench(config, QuietReporter(), start_up=False)
     shown = {row["phase"]: row for row in report["phases of one iteration"]}
-    assert list(shown) == ["collect", "remember", "learn", "tokenizer", "world_model", "imagine"]
+    assert list(shown) == ["collect", "remember", "learn", "tokenizer", "code", "world_model", "imagine"]
     assert sum(row["share %"] for row in shown.values()) == pytest.approx(100)
     assert all(shown[name]["GFLOP/s"] > 0 for name in ("collect", "learn", "world_model", "imagine"))
     # Six iterations of everything; two imagined updates in each of the last four.

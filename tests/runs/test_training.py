@@ -94,7 +94,7 @@ def assert_same(result, uninterrupted):
 def programs() -> list[int]:
     """How many programs each phase has."""
     phases = (Agent.start, Agent.collect, Agent.remember, Agent.learn)
-    phases += (Agent.update_tokenizer, Agent.update_world_model, Agent.imagine)
+    phases += (Agent.update_tokenizer, Agent.code, Agent.update_world_model, Agent.imagine)
     return [phase._cache_size() for phase in phases]
 
 
