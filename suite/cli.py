@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import importlib.metadata
 import os
 import re
 import sys
@@ -16,7 +17,7 @@ from collections.abc import Sequence
 from types import ModuleType
 from typing import NoReturn
 
-from suite.runtime.compilation import quiet_xla
+from suite.runtime.compilation import quiet_xla, refuse_other_arithmetic
 from suite.runtime.errors import RunError, UserError, did_you_mean, host_errors
 
 COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "compare", "sweep", "publish", "verify", "bench")
@@ -27,6 +28,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code."""
     quiet_xla()
     try:
+        refuse_other_arithmetic()
         with host_errors():
             return _dispatch(sys.argv[1:] if argv is None else list(argv))
     except (UserError, RunError) as error:
@@ -47,6 +49,9 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _dispatch(argv: list[str]) -> int:
+    if argv == ["--version"]:
+        print(f"suite {importlib.metadata.version('world-model-suite')}")
+        return 0
     args = parse(argv)
     return importlib.import_module(f"suite.commands.{args.command}").execute(args)
 
@@ -77,6 +82,7 @@ def _parsers(modules: dict[str, ModuleType]) -> tuple[_Parser, dict[str, _Parser
     parser = _Parser(
         prog="suite", description="Sample-efficient reinforcement learning with a transformer world model."
     )
+    parser.add_argument("--version", action="store_true", help="print the version, and nothing else")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     parsers: dict[str, _Parser] = {}
     for name, module in modules.items():

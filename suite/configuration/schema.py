@@ -220,7 +220,7 @@ class Config:
     task: str
     agent: str
     preset: str
-    seed: NotNegative = 0
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # JAX makes a key of 32 bits: others would be the same again
     protocol: ProtocolConfig = ProtocolConfig()
     environment: EnvironmentConfig = EnvironmentConfig()
     policy: PolicyConfig = PolicyConfig()

@@ -15,6 +15,7 @@ from suite.configuration.overrides import apply_changes, parse_overrides
 from suite.configuration.schema import Config
 from suite.registry.catalog import AGENTS, FAMILIES, OPEN_FAMILIES, PRESETS, TASKS
 from suite.registry.entries import DEFAULT_AGENT, AgentEntry, FamilyEntry, Lazy, Made, PresetEntry, TaskEntry
+from suite.runtime.compilation import device_kind
 from suite.runtime.errors import UserError, did_you_mean
 
 __all__ = [
@@ -128,9 +129,7 @@ def layers(
 
 
 def _on_accelerator() -> bool:
-    import jax
-
-    return jax.default_backend() != "cpu"
+    return device_kind() != "cpu"
 
 
 def _with_compute_type(config: Config) -> Config:

@@ -27,6 +27,7 @@ from typing import Any, Protocol
 from suite import registry
 from suite.configuration.schema import Config
 from suite.records.record import RunRecord, require_writable, run_folder
+from suite.runtime.compilation import device_kind
 from suite.runtime.errors import FolderInUseError, UserError
 from suite.runtime.signals import stop_signals
 
@@ -292,9 +293,7 @@ class Process:
 
 def default_jobs() -> int:
     """How many runs this machine takes at once: one on an accelerator, or one for every two CPU cores."""
-    import jax
-
-    if jax.default_backend() != "cpu":
+    if device_kind() != "cpu":
         return 1
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // CPUS_PER_RUN)

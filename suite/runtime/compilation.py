@@ -9,7 +9,17 @@ import platform
 from pathlib import Path
 
 from suite.runtime.cache import cache_dir
+from suite.runtime.errors import UserError
 
+OTHER_ARITHMETIC = (
+    "JAX_ENABLE_X64",
+    "JAX_DEFAULT_DTYPE_BITS",
+    "JAX_DEFAULT_PRNG_IMPL",
+    "JAX_DISABLE_JIT",
+    "JAX_DEBUG_NANS",
+    "JAX_DEBUG_INFS",
+)
+OFF = ("", "0", "false", "f", "no", "n", "off")
 CPU_INFO = Path("/proc/cpuinfo")
 
 
@@ -21,6 +31,38 @@ def quiet_xla() -> None:
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
+
+
+def refuse_other_arithmetic() -> None:
+    """Looks for switches of JAX's that change what is computed, or that its compiled phases do not survive.
+
+    Raises:
+      UserError: one is set in the environment.
+    """
+    for name in OTHER_ARITHMETIC:
+        value = os.environ.get(name, "")
+        if value.lower() not in OFF:
+            raise UserError(
+                f"{name}={value} is set in the environment, and would change results or end the run: unset it"
+            )
+
+
+def device_kind() -> str:
+    """The kind of device that JAX computes on: "cpu", "gpu" or "tpu".
+
+    Raises:
+      UserError: there is none of the kind that is asked for.
+    """
+    import jax
+
+    try:
+        return jax.default_backend()
+    except (RuntimeError, AssertionError) as error:  # which one depends on what is wrong
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        raise UserError(
+            f"JAX finds no device for JAX_PLATFORMS={asked!r}; JAX_PLATFORMS=cpu always works, and without the "
+            "variable JAX takes the fastest device there is"
+        ) from error
 
 
 def enable_compilation_cache() -> None:

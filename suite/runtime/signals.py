@@ -1,4 +1,4 @@
-"""SIGINT (Ctrl-C) and SIGTERM while something runs that should come to a good end first."""
+"""SIGINT (Ctrl-C), SIGTERM and SIGHUP (a closed terminal) while something runs that should come to a good end first."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator
 def stop_signals(heard: Callable[[int], None]) -> Iterator[None]:
     """Each of them calls `heard` with how many there have been, and does nothing else.
 
-    Outside of the main thread, which alone may handle signals, they are left to whoever runs us there.
+    Outside of the main thread, which alone may handle signals, they are left to whoever runs us there; and SIGHUP to
+    `nohup`, which has us ignore it.
     """
     count = 0
 
@@ -20,8 +21,11 @@ def stop_signals(heard: Callable[[int], None]) -> Iterator[None]:
         count += 1
         heard(count)
 
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
     try:
-        before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {number: signal.signal(number, handle) for number in numbers}
     except ValueError:
         before = {}
     try:

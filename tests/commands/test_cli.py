@@ -56,6 +56,7 @@ BAD_RUNS = {
     "preset": (["craftax_classic", "--preset", "papper"], "unknown preset 'papper'; did you mean 'paper'?"),
     "field": ([*SMOKE, "ppo.gamma=1"], "unknown field 'ppo.gamma'; did you mean 'ppo.discount'?"),
     "value": ([*SMOKE, "ppo.clip=wide"], "ppo.clip='wide': input should be a valid number"),
+    "large seed": ([*SMOKE, "--seed", str(2**64)], "seed=18446744073709551616: input should be less than 4294967296"),
     "range": ([*SMOKE, "ppo.clip=-1"], "ppo.clip=-1: input should be greater than 0"),
     "misfit": ([*SMOKE, "environment.num_envs=3"], "ppo.minibatches=2 must divide environment.num_envs=3"),
     "no setting": ([*SMOKE, "fast"], "'fast' is no setting"),
@@ -337,3 +338,26 @@ def test_a_broken_pipe_is_no_traceback():
     env = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[1])}
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, env=env)
     assert done.stderr == ""
+
+
+def test_the_version(suite):
+    from importlib.metadata import version
+
+    assert suite("--version") == (0, f"suite {version('world-model-suite')}\n", "")
+
+
+@pytest.mark.parametrize("variable", ["JAX_ENABLE_X64", "JAX_DEBUG_NANS", "JAX_DISABLE_JIT"])
+def test_other_arithmetic_is_refused(suite, never, monkeypatch, variable):
+    monkeypatch.setenv(variable, "1")
+    refused(suite("run", *SMOKE), f"{variable}=1 is set in the environment", "unset it")
+    monkeypatch.setenv(variable, "False")
+    with pytest.raises(AssertionError, match="should have been refused"):
+        suite("run", *SMOKE)
+
+
+@pytest.mark.parametrize("asked", ["cuda", "nothing"])
+def test_a_kind_of_device_that_is_not_there(asked):
+    """In a process of its own, whose JAX has no device yet; and `python -m suite` is the command."""
+    words = [sys.executable, "-m", "suite", "run", *SMOKE]
+    ran = subprocess.run(words, env=os.environ | {"JAX_PLATFORMS": asked}, capture_output=True, text=True, check=False)
+    refused((ran.returncode, ran.stdout, ran.stderr), f"no device for JAX_PLATFORMS='{asked}'", "JAX_PLATFORMS=cpu")

@@ -31,15 +31,15 @@ def corridor(monkeypatch):
 class StopAt(QuietReporter):
     """Sends this process a signal when a phase begins for the n-th time: as a user, or a cluster, would."""
 
-    def __init__(self, phase: str, times: int):
+    def __init__(self, phase: str, times: int, number: signal.Signals = signal.SIGTERM):
         super().__init__()
-        self.phase, self.times = phase, times
+        self.phase, self.times, self.number = phase, times, number
 
     def update(self, steps, phase, fields):
         if phase == self.phase:
             self.times -= 1
             if self.times == 0:
-                os.kill(os.getpid(), signal.SIGTERM)
+                os.kill(os.getpid(), self.number)
 
 
 class Killed(Exception):  # noqa: N818 -- no error of the run's
@@ -98,9 +98,21 @@ def programs() -> list[int]:
     return [phase._cache_size() for phase in phases]
 
 
-@pytest.mark.parametrize(("phase", "times"), [("collect", 3), ("imagine", 2)])
-def test_a_stopped_and_resumed_run_is_an_uninterrupted_one(tmp_path, uninterrupted, phase, times):
-    stopped = training.run(config(), tmp_path, StopAt(phase, times))
+@pytest.fixture
+def terminal():
+    """A terminal that can be closed: under `nohup` its signal is ignored, and then by the suite too."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize(
+    ("phase", "times", "number"),
+    [("collect", 3, signal.SIGTERM), ("imagine", 2, signal.SIGHUP)],
+    ids=["told", "closed"],
+)
+def test_a_stopped_and_resumed_run_is_an_uninterrupted_one(tmp_path, uninterrupted, terminal, phase, times, number):
+    stopped = training.run(config(), tmp_path, StopAt(phase, times, number))
     assert stopped.status == "stopped"
     assert 0 < stopped.steps < config().total_steps
     before = programs()
