@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from pathlib import Path
 
@@ -10,9 +11,11 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # pages of harmless notes on
 os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 import jax
+import jax.numpy as jnp
 import pytest
 from jax._src import compiler
 
+EMITTERS = "xla_cpu_use_fusion_emitters"
 _compile_options = compiler.get_compile_options
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -94,10 +97,21 @@ def hasty_compilation(request):
     jax.config.update("jax_disable_most_optimizations", True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # processes that the module starts
-        patch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false")
-        patch.setattr(compiler, "get_compile_options", _hasty_options)
+        if _has_switch():
+            patch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} --{EMITTERS}=false")
+            patch.setattr(compiler, "get_compile_options", _hasty_options)
         yield
     jax.config.update("jax_disable_most_optimizations", False)
+
+
+@functools.cache
+def _has_switch() -> bool:
+    """Whether XLA can still make a CPU's loops in the old way: JAX 0.11's cannot."""
+    try:
+        jax.jit(jnp.negative, compiler_options={EMITTERS: False})(jnp.zeros(()))
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def _hasty_options(*arguments, **options):
@@ -106,7 +120,7 @@ def _hasty_options(*arguments, **options):
     JAX has no public setting for the options of all programs. Other devices than a CPU do not read this one.
     """
     found = _compile_options(*arguments, **options)
-    found.env_option_overrides = [*found.env_option_overrides, ("xla_cpu_use_fusion_emitters", False)]
+    found.env_option_overrides = [*found.env_option_overrides, (EMITTERS, False)]
     return found
 
 
