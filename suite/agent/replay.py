@@ -143,8 +143,7 @@ class Replay:
             slot = (state.current_index - 1 - i) % self.length
             return _written(coded, slot, *tokenizer.nearest(codebook, frames[:, slot]))
 
-        stored = jnp.where(state.is_full, self.length, state.current_index)
-        coded = jax.lax.fori_loop(0, jnp.where(codebook.count > known, stored, 0), recode, coded)
+        coded = jax.lax.fori_loop(0, jnp.where(codebook.count > known, self._stored(state), 0), recode, coded)
         coded = jax.lax.fori_loop(0, new, code, coded)
         return state.replace(experience=state.experience.replace(coded=coded))
 
@@ -159,11 +158,14 @@ class Replay:
         with jax.numpy_rank_promotion("allow"):  # flashbax broadcasts as NumPy does
             return self._buffer(batch, length).sample(state, key).experience
 
+    def _stored(self, state: ReplayState) -> jax.Array:
+        """int32 scalar; steps that are stored of each environment."""
+        return jnp.where(state.is_full, self.length, state.current_index)
+
     def _sample_recent(self, state: ReplayState, key: jax.Array, batch: int, length: int, recent: int) -> Experience:
         row_key, age_key = jax.random.split(key)
         row_N = jax.random.randint(row_key, (batch,), 0, self.num_envs)
-        stored = jnp.where(state.is_full, self.length, state.current_index)
-        age_N = jax.random.randint(age_key, (batch,), 0, jnp.minimum(recent, stored - length + 1))
+        age_N = jax.random.randint(age_key, (batch,), 0, jnp.minimum(recent, self._stored(state) - length + 1))
         first_N = state.current_index - length - age_N
         time_NT = (first_N[:, None] + jnp.arange(length)[None]) % self.length
         return jax.tree.map(lambda x: x[row_N[:, None], time_NT], state.experience)
