@@ -317,10 +317,10 @@ def _problems(config: Config) -> Iterator[str]:
         )
     if dream.world == "game" and dream.trust:
         yield "imagination.world=game needs no trust, for its rewards are the true ones: imagination.trust=0"
-    if dream.world == "model" and dream.horizon + dream.context > model.sequence_length:
+    if dream.world == "model" and dream.context >= model.sequence_length:
         yield (
-            f"imagination.horizon={dream.horizon} and imagination.context={dream.context} must together not exceed "
-            f"world_model.sequence_length={model.sequence_length}, the longest context the model has seen"
+            f"imagination.context={dream.context} must be less than world_model.sequence_length="
+            f"{model.sequence_length}: the model reads so many frames, a dream's first one among them"
         )
     if (model.embed_dim // model.heads) % 2:
         yield f"world_model.embed_dim / world_model.heads = {model.embed_dim / model.heads:g} must be even (RoPE)"

@@ -59,30 +59,42 @@ def causal_attention(
     return jnp.concatenate(outputs, axis=1)
 
 
-def cached_attention(query_BQNH: jax.Array, key_BNSH: jax.Array, value_BNSH: jax.Array, last_Q: jax.Array) -> jax.Array:
-    """Attention of new queries to the cached keys and values, each up to index `last_Q` (int32) and with it.
+def held_tokens(seen: jax.Array, slots: int) -> jax.Array:
+    """Which token each slot of a cache holds, int32 [S], after `seen` tokens; negative where it holds none yet.
 
-    These lead with the heads, as the products read them: nothing of the cache's size is moved.
+    Token n stands in slot n modulo `slots`, so that a full cache holds the latest ones.
     """
+    last = seen - 1
+    return last - (last - jnp.arange(slots)) % slots
+
+
+def cached_attention(
+    query_BQNH: jax.Array, key_BNSH: jax.Array, value_BNSH: jax.Array, held_S: jax.Array, last_Q: jax.Array
+) -> jax.Array:
+    """Attention of new queries to the cached keys and values, each up to token `last_Q` (int32) and with it.
+
+    Keys and values lead with the heads, as the products read them: nothing of the cache's size is moved. `held_S` says
+    which token each slot holds (`held_tokens`).
+    """
+    visible_QS = (held_S >= 0)[None] & (held_S[None] <= last_Q[:, None])
     if query_BQNH.shape[1] == 1:
-        return attend_cached(query_BQNH, key_BNSH, value_BNSH, last_Q)
+        return attend_cached(query_BQNH, key_BNSH, value_BNSH, visible_QS)
     # A CPU's caches hold the scores of one stream, not those of all: one after the other is twice as fast and more.
     return jax.lax.platform_dependent(
-        query_BQNH, key_BNSH, value_BNSH, last_Q, cpu=_attend_cached_in_turn, default=attend_cached
+        query_BQNH, key_BNSH, value_BNSH, visible_QS, cpu=_attend_cached_in_turn, default=attend_cached
     )
 
 
-def attend_cached(query_BQNH, key_BNSH, value_BNSH, last_Q) -> jax.Array:
+def attend_cached(query_BQNH, key_BNSH, value_BNSH, visible_QS) -> jax.Array:
     """`cached_attention` of all streams at once, as on devices other than a CPU."""
-    visible_QS = jnp.arange(key_BNSH.shape[2])[None] <= last_Q[:, None]
     mixed_BNQH, _ = _attend(query_BQNH.swapaxes(1, 2), key_BNSH, value_BNSH, visible_QS)
     return mixed_BNQH.swapaxes(1, 2)
 
 
-def _attend_cached_in_turn(query_BQNH, key_BNSH, value_BNSH, last_Q) -> jax.Array:
+def _attend_cached_in_turn(query_BQNH, key_BNSH, value_BNSH, visible_QS) -> jax.Array:
     def attend(stream: tuple[jax.Array, ...]) -> jax.Array:
         query, key, value = (x[None] for x in stream)
-        return attend_cached(query, key, value, last_Q)[0]
+        return attend_cached(query, key, value, visible_QS)[0]
 
     return jax.lax.map(attend, (query_BQNH, key_BNSH, value_BNSH))
 

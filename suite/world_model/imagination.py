@@ -50,8 +50,8 @@ class Past:
 class Dream:
     """A `BatchedEnvironment` whose rules are a world model's. Build it inside the jitted function that uses it.
 
-    Every episode starts from a given real frame, and lasts `horizon` steps at most: no more fit into the cache.
-    A termination does not end it: the model goes on, and the time step says `first`, so that memory is dropped.
+    Every episode starts from a given real frame, and lasts `horizon` steps. The model reads the latest frames, as many
+    as in the sequences that it learned from: a longer view is one that it has never had. A termination does not end it: the model goes on, and the time step says `first`, so that memory is dropped.
     Rewards are class levels, nothing is truncated, and time steps carry no statistics (an empty dict). In a game
     the model also says whose turn is next, what is legal and how chance falls; our seat is the one we started in.
 
@@ -100,8 +100,9 @@ class Dream:
         return DreamState(cache, tokens_BL, turn_B, age_BL), time_step
 
     def _remember(self, start_BL: jax.Array) -> tuple[Cache, jax.Array | None]:
-        """A cache with room for the dream and what the model reads before its start frames; their tokens' ages."""
-        cache = self.model.init_cache(self.num_envs, self.context + self.horizon)
+        """A cache with what the model reads before the start frames, and the ages of these frames' tokens."""
+        longest = self.model.config.sequence_length
+        cache = self.model.init_cache(self.num_envs, min(self.context + self.horizon, longest))
         if self.past is None:
             return cache, None
         turn_PB, action_PB = self.past.turn_PB, self.past.action_PB

@@ -23,7 +23,7 @@ from jax.typing import DTypeLike
 from suite.configuration.schema import WorldModelConfig
 from suite.interface.tokens import TokenSpec
 from suite.nn.dropout import dropout
-from suite.world_model.attention import cached_attention, causal_attention, rope, token_positions
+from suite.world_model.attention import cached_attention, causal_attention, held_tokens, rope, token_positions
 from suite.world_model.block_teacher_forcing import factorization
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
 from suite.world_model.heads import Head, PlaceHead, SymbolsHead, TurnHead, TurnLogits, filled_odds
@@ -33,11 +33,12 @@ TERMINATION_CLASSES = 2
 
 @struct.dataclass
 class Cache:
-    """Keys and values of the tokens seen so far.
+    """Keys and values of the latest tokens.
 
     Attributes:
-      keys, values: [layers, B, N, tokens, H]; keys are rotated already.
-      index: int32 scalar; tokens filled. One that does not fit any more would overwrite the last.
+      keys, values: [layers, B, N, slots, H]; keys are rotated already. Token n stands in slot n modulo their number,
+        so that a block for which there is no room takes the place of the oldest.
+      index: int32 scalar; tokens seen so far.
     """
 
     keys: jax.Array
@@ -255,7 +256,7 @@ class WorldModel(nnx.Module):
         return mixture_odds(made_BLK, self.log_gate(hidden_BSD), self.sources(tokens_BL))
 
     def init_cache(self, batch: int, length: int) -> Cache:
-        """An empty cache for `length` steps of `batch` streams, and the tokens of the frame that the last leads to."""
+        """An empty cache for the latest `length` steps of `batch` streams, and the frame that the last leads to."""
         heads, width = self.config.heads, self.config.embed_dim
         tokens = self.factorization.blocks(length) * self.block
         shape = (self.config.layers, batch, heads, tokens, width // heads)
@@ -270,7 +271,7 @@ class WorldModel(nnx.Module):
     def remember(
         self, cache: Cache, tokens_BCL: jax.Array, action_BC: jax.Array, age_BCL: jax.Array | None = None
     ) -> Cache:
-        """Appends C blocks to the cache, all at once."""
+        """Appends C blocks to an empty cache that has room for them, all at once."""
         x_BCSD = self.embed(tokens_BCL, action_BC, age_BCL)
         cache, _ = self._append(cache, x_BCSD.reshape(len(x_BCSD), -1, x_BCSD.shape[-1]))
         return cache
@@ -284,14 +285,15 @@ class WorldModel(nnx.Module):
 
     def _append(self, cache: Cache, x_BQD: jax.Array) -> tuple[Cache, jax.Array]:
         """Appends embedded tokens, whole units of them."""
-        start = cache.index
-        index_Q = start + jnp.arange(x_BQD.shape[1])
+        start, slots = cache.index, cache.keys.shape[3]
+        seen, place = start + x_BQD.shape[1], start % slots
+        held_S, index_Q = held_tokens(seen, slots), start + jnp.arange(x_BQD.shape[1])
         last_Q = (index_Q // self.unit + 1) * self.unit - 1
         position_SA = self._positions(index_Q)
         graphdef, layers = nnx.split(self.layers)
 
         def append(cached: jax.Array, new_BSNH: jax.Array, index: jax.Array) -> jax.Array:
-            return jax.lax.dynamic_update_slice(cached, new_BSNH.swapaxes(1, 2)[None], (index, 0, 0, start, 0))
+            return jax.lax.dynamic_update_slice(cached, new_BSNH.swapaxes(1, 2)[None], (index, 0, 0, place, 0))
 
         # The cache is carried, not stacked anew by the scan: one block of it is written, in place.
         def run_layer(carry: Any, inputs: tuple[nnx.State, jax.Array]) -> tuple[Any, None]:
@@ -299,12 +301,12 @@ class WorldModel(nnx.Module):
             layer = nnx.merge(graphdef, params)
             query, key, value = layer.attention_inputs(x)
             keys, values = append(keys, rope(key, position_SA), index), append(values, value, index)
-            attended = cached_attention(rope(query, position_SA), keys[index], values[index], last_Q)
+            attended = cached_attention(rope(query, position_SA), keys[index], values[index], held_S, last_Q)
             return (layer.add(x, attended, None), keys, values), None
 
         carry = (x_BQD, cache.keys, cache.values)
         (x, keys, values), _ = jax.lax.scan(run_layer, carry, (layers, jnp.arange(self.config.layers)))
-        return Cache(keys, values, start + x_BQD.shape[1]), self.norm(x)
+        return Cache(keys, values, seen), self.norm(x)
 
     def _positions(self, index_S: jax.Array) -> jax.Array:
         return token_positions(self.config.positions, index_S, self.block, self.grid)

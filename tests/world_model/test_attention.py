@@ -5,7 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from suite.world_model.attention import attend_cached, cached_attention, causal_attention, rope, token_positions
+from suite.world_model.attention import (
+    attend_cached,
+    cached_attention,
+    causal_attention,
+    held_tokens,
+    rope,
+    token_positions,
+)
 
 
 def inputs(steps: int = 5, block: int = 7, heads: int = 2, width: int = 4) -> tuple[jax.Array, ...]:
@@ -75,11 +82,18 @@ def test_cached_attention_sees_only_what_is_filled():
     query, key, value = inputs(steps=3)
     for new in (slice(7, 14), slice(13, 14)):  # a block, and a single token
         last_Q = jnp.full(new.stop - new.start, 13)
-        mixed = cached_attention(query[:, new], key.swapaxes(1, 2), value.swapaxes(1, 2), last_Q)
+        cached = query[:, new], key.swapaxes(1, 2), value.swapaxes(1, 2)
+        mixed = cached_attention(*cached, held_tokens(jnp.int32(14), 21), last_Q)
         np.testing.assert_allclose(mixed, masked_attention(query, key, value, 7)[:, new], atol=1e-6)
         # On other devices all streams at once.
-        together = attend_cached(query[:, new], key.swapaxes(1, 2), value.swapaxes(1, 2), last_Q)
+        together = attend_cached(*cached, jnp.arange(21)[None] <= last_Q[:, None])
         np.testing.assert_allclose(together, mixed, atol=1e-6)
+
+
+def test_a_full_cache_holds_the_latest_tokens():
+    np.testing.assert_array_equal(held_tokens(jnp.int32(2), 4), [0, 1, -2, -1])
+    np.testing.assert_array_equal(held_tokens(jnp.int32(4), 4), [0, 1, 2, 3])
+    np.testing.assert_array_equal(held_tokens(jnp.int32(9), 4), [8, 5, 6, 7])
 
 
 @pytest.mark.parametrize("kind", ["flat", "grid"])

@@ -114,22 +114,23 @@ def learned() -> Learned:
     return Learned(model, tokenizer, codes, float(metrics["token_accuracy"]))
 
 
-def dream_of(learned: Learned, frames: jax.Array, model: WorldModel | None = None) -> Dream:
-    return Dream(model or learned.model, learned.tokenizer, learned.codes, Walk.spec, SPEC, HORIZON, frames)
+def dream_of(learned: Learned, frames: jax.Array, model: WorldModel | None = None, horizon: int = HORIZON) -> Dream:
+    return Dream(model or learned.model, learned.tokenizer, learned.codes, Walk.spec, SPEC, horizon, frames)
 
 
 def test_the_game_is_learned(learned):
     assert learned.accuracy > 0.99
 
 
-def test_the_dream_is_the_game(learned):
+@pytest.mark.parametrize("horizon", [HORIZON, 4 * HORIZON])  # as long as what the model learned from, and longer
+def test_the_dream_is_the_game(learned, horizon):
     frames, action, shown = real_play(seed=7, steps=30, batch=16)
-    action = action[-HORIZON:]
-    real = jax.tree.map(lambda x: x[-HORIZON:], shown)
-    start, imagined = jax.jit(lambda frames, key, action: play(dream_of(learned, frames), key, action))(
-        frames[-HORIZON - 1], jax.random.key(3), action
-    )
-    np.testing.assert_array_equal(start.observation, frames[-HORIZON - 1])
+    action = action[-horizon:]
+    real = jax.tree.map(lambda x: x[-horizon:], shown)
+    start, imagined = jax.jit(
+        lambda frames, key, action: play(dream_of(learned, frames, horizon=horizon), key, action)
+    )(frames[-horizon - 1], jax.random.key(3), action)
+    np.testing.assert_array_equal(start.observation, frames[-horizon - 1])
     np.testing.assert_array_equal(imagined.observation, real.observation)
     np.testing.assert_array_equal(imagined.reward, real.reward)
     np.testing.assert_array_equal(imagined.terminated, real.terminated)
@@ -207,6 +208,8 @@ def test_context_is_what_the_model_would_remember(learned):
     dream = Dream(learned.model, learned.tokenizer, learned.codes, Walk.spec, SPEC, 2, frames[2], past=past, context=2)
     state, _ = dream.reset(jax.random.key(0))
     assert state.cache.keys.shape == cache.keys.shape
+    longer, _ = dataclasses.replace(dream, horizon=20).reset(jax.random.key(0))  # no more than the model has seen
+    assert longer.cache.keys.shape == (2, 3, 4, 5 * 7, 8)
     after, same_hidden = learned.model.step(state.cache, state.tokens_BL, action[2])
     np.testing.assert_allclose(hidden, same_hidden, atol=1e-4)
     np.testing.assert_allclose(cache.keys, after.keys, atol=1e-4)

@@ -98,6 +98,17 @@ def test_cached_logits_equal_uncached_ones(positions, compute_type, blocks):
     assert int(cache.index) == 5 * 7
 
 
+@pytest.mark.parametrize("positions", ["flat", "grid"])
+def test_a_cache_that_is_full_forgets_the_oldest_block(positions):
+    """With one layer, the model then is what it would be of the latest frames alone."""
+    model = small_model(std=0.2, positions=positions, layers=1)
+    cache, step = model.init_cache(3, 3), jax.jit(model.step)
+    for time in range(5):
+        cache, hidden_BSD = step(cache, TOKENS[:, time], ACTION[:, time])
+        seen = slice(max(time - 2, 0), time + 1)
+        np.testing.assert_allclose(hidden_BSD, model(TOKENS[:, seen], ACTION[:, seen])[:, -1], atol=1e-5)
+
+
 def test_bfloat16_is_close_to_float32():
     exact, coarse = (small_model(std=0.1, compute_type=kind) for kind in ("float32", "bfloat16"))
     expected = exact.observation_logits(exact(TOKENS, ACTION))
