@@ -28,10 +28,11 @@ from suite.runtime.reporting import Reporter
 
 COLLECTOR = "mfrl"
 TRAJECTORIES, STEPS = 160, 20  # N_eval, T_eval
+BEFORE = 15  # steps before those: some models are told of what happened earlier
 PAIRS = {"paper": 100_000, "small": 20_000, "smoke": 200}
 VALIDATION = 8  # every so many environments, one is kept for validation; one at least
 SYMBOLS = "symbols"
-VERSION = 1  # of what is kept and how it is drawn
+VERSION = 2  # of what is kept and how it is drawn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,7 +175,7 @@ def collect(agent: Agent, pairs: int, reporter: Reporter) -> tuple[EvaluationSet
     """
     config = agent.config
     envs, length, iterations = config.environment.num_envs, config.environment.rollout_length, config.iterations
-    steps = min(STEPS, length)
+    steps = min(BEFORE + STEPS, length)
     random = np.random.default_rng(config.seed)
     drawn = random.choice(envs * iterations, min(TRAJECTORIES, envs * iterations // 2), replace=False)
     validation_B = np.arange(envs) >= envs - max(1, envs // VALIDATION)

@@ -43,9 +43,10 @@ class Strip:
 
 
 def choose(real: EvaluationSet, steps: int, count: int) -> list[int]:
-    """Trajectories without an end in which most changes: half of them with a reward, where there are so many."""
+    """Trajectories in which most changes, of those whose episode goes on longest: half with a reward, if there are."""
     steps = min(steps, real.action.shape[1])
-    whole = np.all(real.frame_counted[:, :steps], axis=1)
+    lasts = real.frame_counted[:, :steps].sum(axis=1)
+    whole = (lasts == lasts.max()) & (lasts > 0)
     if real.symbols.shape[-1]:  # noise, as of a night, would be the most of what changes in pixels
         seen = real.symbols[:, :steps]
     else:

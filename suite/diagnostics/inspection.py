@@ -133,8 +133,9 @@ def _write_table(path: Path, tables: dict[str, pd.DataFrame]) -> None:
 
 def _write_strips(out: Path, real: EvaluationSet, rollouts_of: dict[str, Rollouts], record: RunRecord) -> None:
     observation = record.spec.observation
-    steps = max(rollouts.steps for rollouts in rollouts_of.values())
-    for number in filmstrips.choose(real, steps, STRIPS):
+    longest = max(rollouts.steps for rollouts in rollouts_of.values())
+    for number in filmstrips.choose(real, longest, STRIPS):
+        steps = int(real.frame_counted[number, :longest].sum())
         notes = ["step 0: start"]
         for t in range(steps):
             reward = real.reward[number, t]
@@ -143,7 +144,7 @@ def _write_strips(out: Path, real: EvaluationSet, rollouts_of: dict[str, Rollout
         strip = filmstrips.Strip(
             title=f"{record.config.task}, trajectory {number}. Outlined: patches that differ from the real frame.",
             real=real.frames[number, : steps + 1],
-            imagined={name: rollouts.frames[number] for name, rollouts in rollouts_of.items()},
+            imagined={name: rollouts.frames[number, :steps] for name, rollouts in rollouts_of.items()},
             notes=notes,
             patch=observation.patch or observation.shape[:2],  # type: ignore[arg-type]
             high=observation.high,

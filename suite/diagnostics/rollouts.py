@@ -18,10 +18,11 @@ import numpy as np
 from flax import nnx
 
 from suite.agent.phases import Agent
-from suite.diagnostics.evaluation_set import EvaluationSet
+from suite.diagnostics.evaluation_set import STEPS, EvaluationSet
 from suite.interface.tokens import TokenizerState, TokenSpec
 from suite.world_model.ages import ages_of
 from suite.world_model.imagination import Past
+from suite.world_model.transformer import WorldModel
 
 CHUNK = 32  # trajectories imagined together
 BINS = 10  # of probabilities, for calibration
@@ -63,8 +64,7 @@ def imagine(
 ) -> Rollouts:
     """Replays the actions of the evaluation set in a world model, its samples drawn as in training.
 
-    A model whose dreams know the frames before their first knows them here too. With them, rollouts are no longer than
-    the model's training sequences: it has never seen more.
+    A model whose dreams know the frames before their first knows them here too.
 
     Args:
       agent: of a single-agent task.
@@ -76,8 +76,7 @@ def imagine(
     past = agent.past
     assert start >= past
     real = real.after(start - past)
-    longest = agent.config.world_model.sequence_length - agent.config.imagination.context
-    steps = min(real.action.shape[1] - past, longest)
+    steps = min(real.action.shape[1] - past, STEPS)
     seen = past + steps
     parts: list[list[np.ndarray]] = []
     copies: list[np.ndarray] = []
@@ -129,7 +128,7 @@ def _imagine(
     tokens_NTL = agent.tokenizer.encode(tokenizer, frames_NTO)
     read = slice(past - context, -1)
     age_NTL = ages_of(tokens_NTL, agent.ages)[:, read] if agent.ages else None
-    hidden = model(tokens_NTL[:, read], action_NT[:, past - context :], age_BTL=age_NTL)[:, context:]
+    hidden = _hidden_states(model, tokens_NTL[:, read], action_NT[:, past - context :], age_NTL)[:, context:]
     tokens_NTL = tokens_NTL[:, past:]
     copied_NT = jnp.zeros(hidden.shape[:2])
     if model.gate_head is not None:
@@ -142,6 +141,16 @@ def _imagine(
         copied_NT,
         tokens_NTL,
     )
+
+
+def _hidden_states(
+    model: WorldModel, tokens_NTL: jax.Array, action_NT: jax.Array, age_NTL: jax.Array | None
+) -> jax.Array:
+    """The model's hidden states [N, T, S, D] of real frames, of which it reads the latest at each, as in a dream."""
+    cache = model.init_cache(len(action_NT), min(action_NT.shape[1], model.config.sequence_length))
+    steps = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (tokens_NTL, action_NT, age_NTL))
+    _, hidden_TNSD = jax.lax.scan(lambda cache, step: model.step(cache, *step), cache, steps)
+    return jnp.swapaxes(hidden_TNSD, 0, 1)
 
 
 def compare(

@@ -51,9 +51,10 @@ class Dream:
     """A `BatchedEnvironment` whose rules are a world model's. Build it inside the jitted function that uses it.
 
     Every episode starts from a given real frame, and lasts `horizon` steps. The model reads the latest frames, as many
-    as in the sequences that it learned from: a longer view is one that it has never had. A termination does not end it: the model goes on, and the time step says `first`, so that memory is dropped.
-    Rewards are class levels, nothing is truncated, and time steps carry no statistics (an empty dict). In a game
-    the model also says whose turn is next, what is legal and how chance falls; our seat is the one we started in.
+    as in the sequences that it learned from: a longer view is one that it has never had. A termination does not end it:
+    the model goes on, and the time step says `first`, so that memory is dropped. Rewards are class levels, nothing is
+    truncated, and time steps carry no statistics (an empty dict). In a game the model also says whose turn is next,
+    what is legal and how chance falls; our seat is the one we started in.
 
     Attributes:
       model: evaluated without dropout.

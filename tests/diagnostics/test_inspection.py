@@ -146,8 +146,8 @@ def test_two_runs_side_by_side(runs, tmp_path):
     out = tmp_path / "out"
     assert found["folder"] == str(out) and list(found["runs"]) == ["m5", "m5_continuous"]
     steps, summary = pd.read_csv(out / "steps.csv"), pd.read_csv(out / "summary.csv")
-    assert steps.run.tolist() == ["m5"] * 4 + ["m5_continuous"] * 4  # no more than the sequences that they learn from
-    assert steps.step.tolist() == [1, 2, 3, 4] * 2
+    assert steps.run.tolist() == ["m5"] * 8 + ["m5_continuous"] * 8  # they learn from sequences of four
+    assert steps.step.tolist() == [*range(1, 9)] * 2
     assert summary.set_index("run").error.to_dict() == {
         name: pytest.approx(row["error"]) for name, row in found["runs"].items()
     }
@@ -161,7 +161,7 @@ def test_two_runs_side_by_side(runs, tmp_path):
     for path in out.iterdir():
         if path.suffix == ".gif":
             with Image.open(path) as film:
-                assert film.n_frames == 5
+                assert film.n_frames == 6  # no episode of the corridor here goes on for more than five steps
         elif path.suffix == ".png":
             with Image.open(path) as image:
                 assert len(image.convert("RGB").getcolors(2**24)) > 2  # not blank
@@ -181,7 +181,7 @@ def test_a_model_that_knows_what_came_before(tmp_path):
     folders = [untrained(tmp_path, "unknown", agent) for agent in ("m5", "m6")]
     inspection.inspect(folders, tmp_path / "out", QUIET)
     steps = pd.read_csv(tmp_path / "out" / "steps.csv").set_index("run")
-    assert steps.step.m5.tolist() == steps.step.m6.tolist() == [1, 2, 3, 4]
+    assert steps.step.m5.tolist() == steps.step.m6.tolist() == [1, 2, 3, 4, 5]
     assert steps.repeated_error.m5.tolist() == steps.repeated_error.m6.tolist()
 
     run = restore(RunRecord.open(folders[1], lock=False), QUIET)
