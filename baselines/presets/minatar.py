@@ -64,6 +64,9 @@ MINATAR_SMALL: dict[str, Any] = {
 # meets one (two of three seeds ended at 1). This is the paper's rate.
 FREEWAY_SMALL: dict[str, Any] = {"ppo.learning_rate": 4.5e-4}
 
+# Twice the steps of `small`, and dreams of twice its length.
+MINATAR_MEDIUM: dict[str, Any] = MINATAR_SMALL | {"protocol.steps": 204_800, "imagination.horizon": 12}
+
 
 def minatar_paper(config: Config) -> Config:
     """Tables "MFRL changes for MinAtar" and "MBRL changes for MinAtar", the same for all games."""
@@ -73,6 +76,16 @@ def minatar_paper(config: Config) -> Config:
 def minatar_small(config: Config) -> Config:
     """A tenth of the paper's budget, with a network and numbers of updates for two CPU cores."""
     return apply_changes(config, MINATAR_PAPER | MINATAR_SMALL)
+
+
+def minatar_medium(config: Config) -> Config:
+    """A fifth of the paper's budget, in less than half an hour on one CPU core."""
+    return apply_changes(config, MINATAR_PAPER | MINATAR_MEDIUM)
+
+
+def freeway_medium(config: Config) -> Config:
+    """`minatar_medium` with Freeway's learning rate."""
+    return apply_changes(minatar_medium(config), FREEWAY_SMALL)
 
 
 def freeway_small(config: Config) -> Config:

@@ -49,7 +49,7 @@ def _minatar(
     name: str,
     summary: str,
     cost: str = "small on one CPU core: m6 7 to 10 min, m5 6 to 8, mfrl 1, 1.9 GiB",
-    small: str = "minatar_small",
+    sizes: str = "minatar",
 ) -> TaskEntry:
     return TaskEntry(
         id=f"minatar/{name}",
@@ -58,7 +58,9 @@ def _minatar(
         spec=Made("adapters.minatar:spec", (name,)),
         make=Lazy("adapters.minatar:make", (name,)),
         scores=Lazy("leaderboards.scoring:returns"),
-        presets=_presets("minatar", paper="minatar_paper", small=small, smoke="minatar_smoke"),
+        presets=_presets(
+            "minatar", paper="minatar_paper", medium=f"{sizes}_medium", small=f"{sizes}_small", smoke="minatar_smoke"
+        ),
         cost=cost,
     )
 
@@ -101,7 +103,7 @@ TASKS = (
     ),
     _minatar("asterix", "MinAtar's Asterix: gold and enemies; 10x10x4, 5 actions"),
     _minatar("breakout", "MinAtar's Breakout; 10x10x4, 3 actions"),
-    _minatar("freeway", "MinAtar's Freeway: cross between cars; 10x10x7, 3 actions", small="freeway_small"),
+    _minatar("freeway", "MinAtar's Freeway: cross between cars; 10x10x7, 3 actions", sizes="freeway"),
     _minatar(
         "seaquest",
         "MinAtar's Seaquest, not among the paper's; 10x10x10, 6 actions",
@@ -116,7 +118,13 @@ TASKS = (
         spec=Lazy("adapters.craftax.task:CLASSIC_SPEC"),
         make=Lazy("adapters.craftax.task:make_classic"),
         scores=Lazy("leaderboards.scoring:craftax"),
-        presets=_presets("craftax", paper="paper", small="craftax_classic_small", smoke="craftax_classic_smoke"),
+        presets=_presets(
+            "craftax",
+            paper="paper",
+            medium="craftax_classic_medium",
+            small="craftax_classic_small",
+            smoke="craftax_classic_smoke",
+        ),
         own_auto_reset=Lazy("adapters.craftax.task:classic_built_in_auto_reset"),
         symbols=Lazy("adapters.craftax.symbols:classic_symbols"),
         symbol_values=17,
@@ -130,7 +138,13 @@ TASKS = (
         spec=Lazy("adapters.craftax.task:FULL_SPEC"),
         make=Lazy("adapters.craftax.task:make_full"),
         scores=Lazy("leaderboards.scoring:craftax"),
-        presets=_presets("craftax", paper="craftax_full_paper", small="craftax_full_small", smoke="craftax_full_smoke"),
+        presets=_presets(
+            "craftax",
+            paper="craftax_full_paper",
+            medium="craftax_full_medium",
+            small="craftax_full_small",
+            smoke="craftax_full_smoke",
+        ),
         own_auto_reset=Lazy("adapters.craftax.task:full_built_in_auto_reset"),
         cost="compiles for 1 min at first; small on one CPU core: m5 10 min, mfrl 5, 3.5 GiB; paper: an accelerator",
         paper_agent="m5_slow",
@@ -310,6 +324,11 @@ AGENTS = (
 PRESETS = (
     PresetEntry(
         "paper", "the paper's Appendix A; only these compare with the paper's results (default on an accelerator)"
+    ),
+    PresetEntry(
+        "medium",
+        "an hour on one CPU core, in MinAtar a third of that: the most steps, and the longest dreams, that it has time "
+        "for; not of OpenSpiel, where small has the paper's budget",
     ),
     PresetEntry("small", "scaled down so that two CPU cores learn something in minutes (default on a CPU)"),
     PresetEntry(

@@ -284,7 +284,7 @@ def test_random_learns_nothing():
 
 
 @pytest.mark.parametrize("task", ["craftax_classic", "craftax_full", "minatar/breakout"])
-@pytest.mark.parametrize("preset", ["paper", "small", "smoke"])
+@pytest.mark.parametrize("preset", ["paper", "medium", "small", "smoke"])
 @pytest.mark.parametrize("agent", sorted(registry.agents()))
 def test_every_agent_has_every_preset(agent, preset, task):
     config = registry.resolve(task, agent, preset)

@@ -95,7 +95,7 @@ def test_bad_runs(suite, never, name):
         (["describe", "craftax"], "unknown task 'craftax'; did you mean 'craftax_full'?"),
         (["describe", "craftax_classic", "--agent", "m5x"], "unknown agent 'm5x'; did you mean 'm5'?"),
         (["describe", "craftax_classic", "tokenizer.patch=[70,5]"], "patches of 70x5 are larger than a frame of 63x63"),
-        (["bench", "craftax_classic", "--preset", "x"], "unknown preset 'x'; valid: paper, small, smoke"),
+        (["bench", "craftax_classic", "--preset", "x"], "unknown preset 'x'; valid: medium, paper, small, smoke"),
         (["evaluate", "nowhere"], "nowhere is no run folder: it has no record.json"),
         (["evaluate", "."], ". is no run folder"),
         (["evaluate", ".", "more"], "unexpected argument 'more'"),
@@ -297,7 +297,8 @@ def test_evaluate_prints_scores(suite, folder, monkeypatch):
 def test_lists(suite):
     assert "craftax_classic" in suite("list", "tasks")[1]
     assert "reward 69.66 +- 1.20 %" in suite("list", "agents")[1]
-    assert [line.split()[0] for line in suite("list", "presets")[1].splitlines()] == ["paper", "small", "smoke"]
+    presets = suite("list", "presets")[1]
+    assert [line.split()[0] for line in presets.splitlines()] == ["paper", "medium", "small", "smoke"]
     assert json.loads(suite("list", "agents", "--json")[1]).keys() == registry.agents().keys()
 
 
