@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -28,6 +28,30 @@ def evaluation_key(seed: int, step: int) -> jax.Array:
 def iteration_key(seed: int, iteration: int) -> jax.Array:
     """Randomness of an iteration, which depends on nothing else: a run that goes on needs no other."""
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), 2), iteration)
+
+
+def first_programs(agent: Agent, state: TrainState) -> Iterator[tuple[str, jax.stages.Lowered]]:
+    """What a run's first iteration will call, dreams apart, by phase and in its order: traced, and not yet compiled.
+
+    Args:
+      agent: whose phases they are.
+      state: shapes and dtypes of a fresh state, from `jax.eval_shape`.
+    """
+    key = jax.eval_shape(lambda: start_key(0))
+    policy_state, replay, tokenizer, world_model = state.policy, state.replay, state.tokenizer, state.world_model
+    collected = Agent.collect.lower(agent, policy_state.acting, state.rollout, key)
+    yield "collect", collected
+    _, trajectory, _ = collected.out_info
+    if replay is not None:
+        yield "remember", Agent.remember.lower(agent, replay, trajectory)
+    if agent.learns_from_real:
+        steps = jax.ShapeDtypeStruct((2,), jnp.float32)
+        yield "learn", Agent.learn.lower(agent, policy_state, trajectory, steps)
+    if world_model is not None and tokenizer is not None:
+        yield "tokenizer", Agent.update_tokenizer.lower(agent, tokenizer, replay, key)
+        if agent.lasting_tokenizer is not None:
+            yield "code", Agent.code.lower(agent, replay, tokenizer, tokenizer.count)
+        yield "world_model", Agent.update_world_model.lower(agent, world_model, tokenizer, replay, key)
 
 
 def plain_call(phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -59,8 +83,7 @@ def iterate(
     Returns:
       the state after it, and the real steps taken by then.
     """
-    config = agent.config
-    imagined_updates = imagined_updates or config.imagined_updates
+    imagined_updates = imagined_updates or agent.config.imagined_updates
     collect_key, tokenizer_key, model_key, dream_key = jax.random.split(key, 4)
     policy_state, rollout_state, replay = state.policy, state.rollout, state.replay
     tokenizer, world_model = state.tokenizer, state.world_model
@@ -73,7 +96,7 @@ def iterate(
         replay = call("remember", agent.remember, replay, trajectory)
 
     # Step 2: the policy learns from them.
-    if config.ppo.learn_from_real and config.policy.kind != "uniform":
+    if agent.learns_from_real:
         policy_state, _ = call("learn", agent.learn, policy_state, trajectory, jnp.array([before, steps], jnp.float32))
     del trajectory, log  # their memory is the world model's now
 

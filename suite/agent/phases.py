@@ -87,6 +87,11 @@ class Agent:
         return [f"{phase}/{metric}" for phase, metrics in phases.items() for metric in metrics]
 
     @property
+    def learns_from_real(self) -> bool:
+        """Whether real play teaches its policy."""
+        return self.config.ppo.learn_from_real and self.config.policy.kind != "uniform"
+
+    @property
     def ages(self) -> int:
         """The highest age of a token that the world model is told; 0: it is told none."""
         return self.config.world_model.ages if self.config.world_model.enabled and self.tokens.spatial else 0

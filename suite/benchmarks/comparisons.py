@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from suite import registry
+from suite.agent.algorithm import first_programs, iterate, iteration_key, start_key
 from suite.agent.phases import Agent
 from suite.configuration.schema import Config
 from suite.interface.batching import Batched
@@ -25,7 +26,7 @@ from suite.interface.environment import BatchedEnvironment, Environment
 from suite.interface.host import HostEnvironment
 from suite.interface.tokens import TokenSpec
 from suite.interface.turns import choose_event
-from suite.runtime.compilation import enable_compilation_cache
+from suite.runtime.compilation import Ahead, enable_compilation_cache
 from suite.world_model.attention import causal_attention
 from suite.world_model.block_teacher_forcing import factorization
 from suite.world_model.imagination import next_frame
@@ -218,7 +219,7 @@ def _random_tokens(tokens: TokenSpec, lead: tuple[int, ...]) -> jax.Array:
 def compare_starts(config: Config) -> Rows:
     """Starts the same command in two new processes that share a cache folder, empty before the first.
 
-    The seconds are a whole process's: from its start until it has computed its first policy update.
+    The seconds are from a process's start until it has computed its first policy update; then it is killed.
     """
     rows: Rows = []
     with tempfile.TemporaryDirectory() as folder:
@@ -226,23 +227,33 @@ def compare_starts(config: Config) -> Rows:
         for name in ("first start", "second start"):
             start = time.perf_counter()
             command = [sys.executable, "-m", "suite.benchmarks.comparisons", json.dumps(config.as_dict())]
-            subprocess.run(command, env=environment, capture_output=True, check=True)
-            rows.append({"start": name, "seconds": time.perf_counter() - start})
+            with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+                assert process.stdout is not None and process.stderr is not None
+                if not process.stdout.readline():
+                    raise RuntimeError(process.stderr.read().decode())
+                rows.append({"start": name, "seconds": time.perf_counter() - start})
+                process.kill()
     for row in rows:
         row["times faster"] = rows[0]["seconds"] / row["seconds"]
     return rows
 
 
-def _first_training_step(config: Config) -> None:
-    """What `compare_starts` runs: the start of `suite.runs.training`, up to the first policy update."""
+def _first_policy_update(config: Config) -> None:
+    """What `compare_starts` runs: the start of `suite.runs.training`. Prints a line after the first policy update."""
     enable_compilation_cache()
-    agent = Agent(config, registry.task(config.task).make()(None))
-    state = agent.init(jax.random.key(0))
-    rollout_state, trajectory, _ = agent.collect(state.policy.acting, state.rollout, jax.random.key(1))
-    if config.ppo.learn_from_real:
-        jax.block_until_ready(agent.learn(state.policy, trajectory, jnp.zeros(2, jnp.float32)))
-    jax.block_until_ready(rollout_state)
+    agent, key = Agent(config, registry.task(config.task).make()(None)), start_key(config.seed)
+    ahead, last = Ahead(), "learn" if agent.learns_from_real else "collect"
+    ahead.begin(first_programs(agent, jax.eval_shape(agent.init, key)))
+
+    def call(phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        ahead.wait(phase)
+        result = jax.block_until_ready(function(*arguments))
+        if phase == last:
+            print(phase, flush=True)
+        return result
+
+    iterate(agent, agent.init(key), iteration_key(config.seed, 0), 0, call)
 
 
 if __name__ == "__main__":
-    _first_training_step(Config(**json.loads(sys.argv[1])))
+    _first_policy_update(Config(**json.loads(sys.argv[1])))

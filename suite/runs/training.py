@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from suite import registry
-from suite.agent.algorithm import iterate, iteration_key, start_key
+from suite.agent.algorithm import first_programs, iterate, iteration_key, start_key
 from suite.agent.phases import Agent
 from suite.agent.state import TrainState
 from suite.configuration.schema import Config
@@ -21,6 +21,7 @@ from suite.records import checkpoint
 from suite.records.record import RunRecord, disk_full_is_an_error, run_folder
 from suite.runs.evaluation import episode_rows, record_evaluation
 from suite.runs.saved_model import Remainder, SavedModel, agent_for
+from suite.runtime.compilation import Ahead
 from suite.runtime.errors import RunError, UserError, host_errors
 from suite.runtime.reporting import Reporter
 from suite.runtime.signals import stop_signals
@@ -85,6 +86,7 @@ class _Training:
         self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
         self.recorded_seconds: dict[str, float] = {}  # of those, what timing.csv has
         self.stop_requested = False
+        self.ahead = Ahead()
 
     @property
     def done(self) -> bool:
@@ -115,6 +117,7 @@ class _Training:
             self.record.update(status="failed")
             raise
         finally:
+            self.ahead.close()
             self.reporter.stop()
             self.record.add_wall_clock(time.monotonic() - started, self.seconds)
         return _result(self.record, "finished" if self.record.finished else "stopped")
@@ -130,6 +133,7 @@ class _Training:
         restored = checkpoint.restore_latest(self.checkpoints, SavedModel.of(template), remainder)
         if restored is None:
             self.record.rewind(0)
+            self.ahead.begin(first_programs(self.agent, template))
             return self.agent.init(key)
         for warning in restored.warnings:
             self.reporter.warning(warning)
@@ -138,6 +142,8 @@ class _Training:
         self.recorded_seconds = dict(self.seconds)
         self.record.rewind(self.steps)
         self.reporter.message(f"resuming at step {self.steps:,}")
+        if not self.done:
+            self.ahead.begin(first_programs(self.agent, template))
         return Remainder(**restored.resume).with_model(restored.model)
 
     def _iterate(self, state: TrainState) -> TrainState:
@@ -160,8 +166,10 @@ class _Training:
         """Runs and times a phase; keeps its metrics and, of real play, the episodes."""
         if phase in PART_OF:
             with self._timed(PART_OF[phase]):
+                self.ahead.wait(phase)
                 return jax.block_until_ready(function(*arguments))
         with self._phase(phase):
+            self.ahead.wait(phase)
             result = function(*arguments)
             if phase == "collect":
                 _, trajectory, log = result

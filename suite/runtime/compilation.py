@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import hashlib
 import logging
 import os
 import platform
+import threading
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from suite.runtime.cache import cache_dir
 from suite.runtime.errors import UserError
+
+if TYPE_CHECKING:
+    import jax
+
+AT_ONCE = 2  # programs compiled side by side: each takes a core and some gigabytes
 
 OTHER_ARITHMETIC = (
     "JAX_ENABLE_X64",
@@ -85,3 +94,43 @@ def cpu_digest() -> str:
     flags = next((line for line in lines if line.lower().startswith(("flags", "features"))), "")
     features = " ".join(sorted(flags.partition(":")[2].split()))
     return hashlib.sha256(f"{platform.machine()} {features}".encode()).hexdigest()[:8]
+
+
+class Ahead:
+    """Programs that are compiled beside each other, before they are called and while others run.
+
+    JAX keeps what it compiled for a function and the shapes of its arguments: a call after `wait` compiles nothing.
+    """
+
+    def __init__(self) -> None:
+        self._pool = concurrent.futures.ThreadPoolExecutor(1 + AT_ONCE)
+        self._compiled: dict[str, concurrent.futures.Future] = {}
+        self._traced: concurrent.futures.Future | None = None
+        self._changed = threading.Condition()
+
+    def begin(self, programs: Iterable[tuple[str, jax.stages.Lowered]]) -> None:
+        """Compiles them in threads of its own: programs by name, in the order in which they are needed."""
+        self._traced = self._pool.submit(self._trace, programs)
+        self._traced.add_done_callback(lambda _: self._notify())
+
+    def wait(self, name: str) -> None:
+        """Returns when the program of that name is compiled, if there is one; raises what was raised of it."""
+        traced = self._traced
+        if traced is None:
+            return
+        with self._changed:
+            self._changed.wait_for(lambda: name in self._compiled or traced.done())
+        self._compiled.get(name, traced).result()
+
+    def close(self) -> None:
+        """Begins no more of them; those that are being compiled are not interrupted."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _trace(self, programs: Iterable[tuple[str, jax.stages.Lowered]]) -> None:
+        for name, lowered in programs:
+            self._compiled[name] = self._pool.submit(lowered.compile)
+            self._notify()
+
+    def _notify(self) -> None:
+        with self._changed:
+            self._changed.notify_all()

@@ -52,3 +52,33 @@ def test_the_users_own_settings_stay(monkeypatch, tmp_path, cache_setting):
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
     compilation.quiet_xla()
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "0"
+
+
+def test_programs_are_compiled_ahead_once_each_and_their_errors_are_raised_where_they_are_needed():
+    class Program:
+        def __init__(self, error=None):
+            self.error, self.times = error, 0
+
+        def compile(self):
+            self.times += 1
+            if self.error:
+                raise self.error
+
+    good, bad = Program(), Program(ValueError("too large"))
+
+    def programs():
+        yield "good", good
+        yield "bad", bad
+        raise TypeError("cannot be traced")
+
+    ahead = compilation.Ahead()
+    ahead.wait("good")  # nothing has begun, so there is nothing to wait for
+    ahead.begin(programs())
+    ahead.wait("good")
+    ahead.wait("good")
+    with pytest.raises(ValueError, match="too large"):
+        ahead.wait("bad")
+    with pytest.raises(TypeError, match="cannot be traced"):
+        ahead.wait("later")
+    ahead.close()
+    assert (good.times, bad.times) == (1, 1)
