@@ -81,6 +81,7 @@ HASTY = (
     "nn",
     "policy",
     "runs",
+    "test_api.py",
     "test_docs.py",
     "test_gpu_script.py",
     "tokenizers",

@@ -51,22 +51,25 @@ def dotted(config: Config) -> dict[str, Any]:
     return fields
 
 
-def parse_overrides(overrides: Sequence[str]) -> dict[str, Any]:
-    """Dotted names to values; values are JSON or Python literals, anything else is a string.
+def parse_overrides(overrides: Sequence[str] | Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted names to values; where they are text, values are JSON or Python literals, anything else is a string.
 
     Raises:
       UserError: not of the form `dotted.name=value`, or no such field.
     """
+    changes = dict(overrides) if isinstance(overrides, Mapping) else dict(map(_parsed, overrides))
     names = [name for name in dotted(Config(task="", agent="", preset="")) if "." in name]
-    changes = {}
-    for override in overrides:
-        name, equals, text = override.partition("=")
-        if not equals:
-            raise UserError(f"{override!r} is no setting; write dotted.name=value, such as ppo.discount=0.97")
+    for name in changes:
         if name not in names:
             raise UserError(f"unknown field {name!r}; {_suggestion(name, names)}")
-        changes[name] = _literal(text)
     return changes
+
+
+def _parsed(override: str) -> tuple[str, Any]:
+    name, equals, text = override.partition("=")
+    if not equals:
+        raise UserError(f"{override!r} is no setting; write dotted.name=value, such as ppo.discount=0.97")
+    return name, _literal(text)
 
 
 def apply_changes(config: Config, changes: Mapping[str, Any]) -> Config:

@@ -74,7 +74,7 @@ def resolve(
     task: str,
     agent: str | None = None,
     preset: str | None = None,
-    overrides: Sequence[str] = (),
+    overrides: Sequence[str] | Mapping[str, Any] = (),
     seed: int = 0,
     steps: int | None = None,
 ) -> Config:
@@ -85,7 +85,7 @@ def resolve(
       agent: an agent's id; None: "m5", and under "paper" the one that the paper's table of this task reports.
       preset: a preset's name; None: "paper" where there is an accelerator, else "small"; the task's first if it lacks
         that one.
-      overrides: the user's "dotted.name=value", the last word on every field.
+      overrides: the user's "dotted.name=value", or values by dotted name: the last word on every field.
       seed: of all randomness.
       steps: real environment steps; None: the preset's.
 
@@ -99,7 +99,7 @@ def layers(
     task: str,
     agent: str | None = None,
     preset: str | None = None,
-    overrides: Sequence[str] = (),
+    overrides: Sequence[str] | Mapping[str, Any] = (),
     seed: int = 0,
     steps: int | None = None,
 ) -> list[tuple[Source, Config]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +51,27 @@ class Result:
     evaluation: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
-def run(config: Config, out: Path, reporter: Reporter, resume: bool = False) -> Result:
+@dataclasses.dataclass(frozen=True)
+class Iteration:
+    """What one iteration of Algorithm 1 left in the record.
+
+    Attributes:
+      step: real steps taken by then.
+      metrics: its row of `metrics.csv`, by column.
+      episodes: the rows of `episodes.csv` of the episodes that ended in it, by column.
+    """
+
+    step: int
+    metrics: dict[str, Any]
+    episodes: list[dict[str, Any]]
+
+
+Callback = Callable[[Iteration], bool | None]
+
+
+def run(
+    config: Config, out: Path, reporter: Reporter, resume: bool = False, callbacks: Sequence[Callback] = ()
+) -> Result:
     """Trains one agent on one task, or goes on where an earlier call of the same command stopped.
 
     Args:
@@ -59,6 +79,7 @@ def run(config: Config, out: Path, reporter: Reporter, resume: bool = False) -> 
       out: the folder of all runs; this one's is `<out>/<task>/<agent>/<preset>/seed_<n>`.
       reporter: where progress goes.
       resume: insist that there is a run to go on with.
+      callbacks: called after each iteration; if one returns True, the run stops with a checkpoint.
 
     Raises:
       UserError: before anything is compiled: the folder cannot be written, is in use, or holds another run.
@@ -71,14 +92,17 @@ def run(config: Config, out: Path, reporter: Reporter, resume: bool = False) -> 
     with RunRecord.open_or_create(folder, config, entry.spec()) as record, disk_full_is_an_error():
         if record.finished:
             return _result(record, "already finished")
-        return _Training(config, agent_for(config, reporter), record, reporter).run()
+        return _Training(config, agent_for(config, reporter), record, reporter, callbacks).run()
 
 
 class _Training:
-    """The host's side of a run: phases in order, their metrics and timing, checkpoints, signals."""
+    """The host's side of a run: phases in order, their metrics and timing, checkpoints, signals, callbacks."""
 
-    def __init__(self, config: Config, agent: Agent, record: RunRecord, reporter: Reporter):
+    def __init__(
+        self, config: Config, agent: Agent, record: RunRecord, reporter: Reporter, callbacks: Sequence[Callback]
+    ):
         self.config, self.agent, self.record, self.reporter = config, agent, record, reporter
+        self.callbacks = callbacks
         self.checkpoints = record.folder / "checkpoints"
         self.iteration = self.steps = 0
         self.metrics: dict[str, Any] = {}  # of the present iteration
@@ -160,6 +184,9 @@ class _Training:
         self.record.append_metrics(row, self.agent.metric_names)
         self._record_timing()
         self.reporter.update(self.steps, "", {} if mean_return is None else {"return": mean_return})
+        for callback in self.callbacks:
+            if callback(Iteration(self.steps, row, self.rows)):
+                self.stop_requested = True
         return state
 
     def _call(self, phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
