@@ -181,8 +181,8 @@ def check_auto_reset(play: Play) -> None:
 
 
 @functools.cache
-def _programs(environment: Environment, num_envs: int, steps: int):
-    """Compiled once for each environment object: reset of a batch, T events of it, a reset by hand.
+def programs(environment: Environment, num_envs: int, steps: int):
+    """Compiled once for each environment object: B resets by hand, with keys and seats [B], and T events of a batch.
 
     An event is what the batch makes of it, and what stepping alone does: in one program, as a large game takes a minute
     to compile.
@@ -202,19 +202,22 @@ def _programs(environment: Environment, num_envs: int, steps: int):
         carry = batched.step(step_key, state, action_B)
         return carry, (carry, by_hand, step_key)
 
+    def reset(key, seat):
+        return environment.reset(key, seat) if environment.spec.two_player else environment.reset(key)
+
     return (
-        jax.jit(batched.reset),
+        jax.jit(jax.vmap(reset)),
         jax.jit(lambda carry, key: jax.lax.scan(event, carry, jax.random.split(key, steps))),
-        jax.jit(environment.reset),
     )
 
 
 def _play(environment, key, steps, num_envs, prepare) -> tuple[Play, list[TimeStep]]:
     """The play, and what went on from there."""
-    reset, events, reset_one = _programs(environment, num_envs, steps)
+    resets, events = programs(environment, num_envs, steps)
     reset_key, events_key = jax.random.split(key)
-    state, shown = reset(reset_key)
-    _equal(shown, reset(reset_key)[1])
+    beginning = jax.random.split(reset_key, num_envs), seats_of(np.arange(num_envs))
+    state, shown = resets(*beginning)
+    _equal(shown, resets(*beginning)[1])
     assert bool(shown.first.all())
     start = prepare(state), shown
     carry, (after, by_hand, keys) = events(start, events_key)
@@ -229,12 +232,18 @@ def _play(environment, key, steps, num_envs, prepare) -> tuple[Play, list[TimeSt
     states, shown, (stepped_states, stepped) = jax.tree.map(_numpy, (states, shown, by_hand))
     fresh_states, fresh = jax.tree.map(np.zeros_like, (stepped_states, stepped))
     reset_keys_TB = jax.vmap(lambda key: jax.random.split(key, (2, num_envs))[1])(keys)
-    for t, b in zip(*np.nonzero(stepped.terminated | stepped.truncated), strict=True):
-        seat = (jnp.int32(1 + b % 2),) if environment.spec.two_player else ()
-        one = reset_one(reset_keys_TB[t, b], *seat)
-        for whole, part in zip(*map(jax.tree.leaves, ((fresh_states, fresh), one)), strict=True):
+    ends = np.argwhere(stepped.terminated | stepped.truncated)
+    for some in np.split(ends, range(num_envs, len(ends), num_envs)):
+        t, b = np.resize(some, (num_envs, 2)).T  # as many as are compiled
+        begun = resets(reset_keys_TB[t, b], seats_of(b))
+        for whole, part in zip(*map(jax.tree.leaves, ((fresh_states, fresh), begun)), strict=True):
             whole[t, b] = _numpy(part)
     return Play(states, shown, stepped_states, stepped, fresh_states, fresh), further
+
+
+def seats_of(index_B: np.ndarray) -> jax.Array:
+    """The seats that `Batched` gives environments of these indices."""
+    return jnp.asarray(1 + index_B % 2, jnp.int32)
 
 
 def _following(first: TimeStep, later: TimeStep) -> TimeStep:

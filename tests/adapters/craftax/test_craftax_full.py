@@ -11,11 +11,10 @@ import pytest
 
 from adapters.craftax.full_renderer import make_renderer
 from adapters.craftax.task import FULL_SPEC, CraftaxFull, full_built_in_auto_reset
-from suite.interface.batching import Batched
 from tests.adapters.craftax.frames import check_equal, original_renderer
-from tests.contract import check_environment
+from tests.contract import check_environment, programs
 
-STEPS, BATCH = 250, 8
+STEPS, BATCH = 125, 16
 FRAMES = 256
 NECROMANCER = 32  # of craftax's BlockType
 BOSS_LEVEL = 8
@@ -33,7 +32,7 @@ def play(environment):
     def prepare(state):
         return state.replace(
             player_health=state.player_health.at[jnp.array([0, 2])].set(0.0),
-            timestep=jnp.array([99_999, 99_999, 5, 5, 250, 0, 0, 0], jnp.int32),
+            timestep=jnp.array([99_999, 99_999, 5, 5, 250] + 11 * [0], jnp.int32),
             boss_progress=state.boss_progress.at[3].set(BOSS_LEVEL),
         )
 
@@ -69,9 +68,9 @@ def test_random_play_achieves_and_is_counted(play):
 
 def test_a_world_does_not_depend_on_its_place_in_a_batch(environment):
     """jaxlib 0.10.2 gets this wrong on a CPU for every index from 8 on."""
-    reset = jax.jit(jax.vmap(environment.reset))
-    keys = jax.random.split(jax.random.key(11), 16)
-    worlds, rolled = (reset(k)[0].map for k in (keys, jnp.roll(keys, 8)))
+    resets, _ = programs(environment, BATCH, STEPS)
+    keys = jax.random.split(jax.random.key(11), BATCH)
+    worlds, rolled = (resets(k, jnp.ones(BATCH, jnp.int32))[0].map for k in (keys, jnp.roll(keys, 8)))
     np.testing.assert_array_equal(worlds, np.roll(rolled, -8, axis=0))
     assert len(np.unique(np.asarray(worlds).reshape(16, -1), axis=0)) == 16
 
@@ -167,8 +166,8 @@ def arbitrary_state(key: jax.Array, state):
     )
 
 
-def test_frames_of_arbitrary_states(environment, renderers):
-    template = jax.tree.map(lambda array: array[0], jax.jit(Batched(environment, BATCH).reset)(jax.random.key(0))[0])
+def test_frames_of_arbitrary_states(play, renderers):
+    template = jax.tree.map(lambda array: jnp.asarray(array[0, 5]), play.states)
     states = jax.jit(jax.vmap(arbitrary_state, in_axes=(0, None)))(
         jax.random.split(jax.random.key(1), FRAMES), template
     )
