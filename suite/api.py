@@ -222,7 +222,7 @@ class Player:
           greedy: the likeliest action instead of a sampled one, as episodes are never scored.
 
         Raises:
-          UserError: arrays of other shapes.
+          UserError: arrays of other shapes or types.
         """
         logits = self.preferences(observation, first, acting)
         if legal is not None:
@@ -292,13 +292,16 @@ class Dreamer:
           seed: of what is drawn.
 
         Raises:
-          UserError: arrays of other shapes.
+          UserError: arrays of other shapes or types, or actions that there are not.
         """
         shape = self.spec.observation.shape
         frames_BO, alone = _batch(frames, shape, "frames")
         actions_BT = np.atleast_2d(np.asarray(actions, np.int32))
         if actions_BT.ndim != 2 or len(actions_BT) != len(frames_BO):
             raise UserError(f"actions have shape {list(np.shape(actions))}, expected {len(frames_BO)} times steps")
+        most = self.spec.num_actions - 1
+        if actions_BT.size and not 0 <= actions_BT.min() <= actions_BT.max() <= most:
+            raise UserError(f"actions are {actions_BT.min()} to {actions_BT.max()}, expected 0 to {most}")
         past = None
         if before is not None:
             earlier, taken = np.asarray(before[0], np.uint8), np.asarray(before[1], np.int32)
@@ -386,7 +389,9 @@ def _batch(array: np.ndarray, shape: tuple[int, ...], name: str) -> tuple[jax.Ar
     found = np.asarray(array)
     alone = found.shape == shape
     if not alone and found.shape[1:] != shape:
-        raise UserError(f"{name} has shape {list(found.shape)}, expected {list(shape)}, or several of it")
+        raise UserError(f"{name}: shape {list(found.shape)}, expected {list(shape)}, or several of it")
+    if found.dtype.kind not in "bui":
+        raise UserError(f"{name}: numbers of type {found.dtype}, expected whole ones, as the task shows them (uint8)")
     return jnp.asarray(found[None] if alone else found, jnp.uint8), alone
 
 

@@ -98,8 +98,10 @@ def test_the_policy_acts_as_in_training(trained):
     legal = np.zeros((2, run.spec.num_actions), bool)
     legal[:, 1] = True
     assert policy.act(frames[0], legal=legal).tolist() == [1, 1]
-    with pytest.raises(UserError, match=r"observation has shape \[5\], expected"):
-        policy.act(np.zeros(5))
+    with pytest.raises(UserError, match=r"observation: shape \[5\], expected"):
+        policy.act(np.zeros(5, np.uint8))
+    with pytest.raises(UserError, match="observation: numbers of type float64, expected whole ones"):
+        policy.act(frames[0] / 255)
 
 
 def test_dreams_are_those_of_the_world_model(trained):
@@ -129,6 +131,8 @@ def test_dreams_are_those_of_the_world_model(trained):
     np.testing.assert_array_equal(model.encode(frames_BT[0, 0]), tokens[0])
     with pytest.raises(UserError, match="and this model is told of"):
         model.dream(frames_BT[:, 1], actions_BT[:, 1:], (frames_BT[:, :1], actions_BT[:, :1]))
+    with pytest.raises(UserError, match="actions are -1 to 1, expected 0 to 1"):
+        model.dream(frames_BT[0, 0], [-1, 1])
     with pytest.raises(UserError, match="expected 3 times steps"):
         model.dream(frames_BT[:, 0], actions_BT[0])
 
