@@ -18,7 +18,9 @@ from suite.runtime.errors import UserError
 if TYPE_CHECKING:
     import jax
 
-AT_ONCE = 2  # programs compiled side by side: each takes a core and some gigabytes
+# Programs compiled beside the main thread. XLA compiles one with several threads already: with two of them a first
+# policy update came five seconds later on two cores.
+AT_ONCE = 1
 
 OTHER_ARITHMETIC = (
     "JAX_ENABLE_X64",
