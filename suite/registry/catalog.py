@@ -327,7 +327,7 @@ PRESETS = (
     ),
     PresetEntry(
         "medium",
-        "an hour on one CPU core, in MinAtar a third of that: the most steps, and the longest dreams, that it has time "
+        "an hour on one CPU core, in MinAtar less than half of that: the most steps, and the longest dreams, that it has time "
         "for; not of OpenSpiel, where small has the paper's budget",
     ),
     PresetEntry("small", "scaled down so that two CPU cores learn something in minutes (default on a CPU)"),
