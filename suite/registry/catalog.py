@@ -327,8 +327,8 @@ PRESETS = (
     ),
     PresetEntry(
         "medium",
-        "an hour on one CPU core, in MinAtar less than half of that: the most steps, and the longest dreams, that it has time "
-        "for; not of OpenSpiel, where small has the paper's budget",
+        "an hour on one CPU core, in MinAtar less than half of that: the most steps, and the longest dreams, that it "
+        "has time for; not of OpenSpiel, where small has the paper's budget",
     ),
     PresetEntry("small", "scaled down so that two CPU cores learn something in minutes (default on a CPU)"),
     PresetEntry(
