@@ -31,18 +31,20 @@ class Game:
       objects: planes of its observation.
       actions: those that do something.
       rewards: all that a step can pay, ascending.
+      longest: steps after which an episode is cut off.
     """
 
     reference: str
     objects: int
     actions: tuple[str, ...]
     rewards: tuple[float, ...] = (0.0, 1.0)
+    longest: int = 1_000
 
 
 GAMES = {
     "asterix": Game("asterix:MinAsterix", 4, ("none", "left", "up", "right", "down")),
     "breakout": Game("breakout:MinBreakout", 4, ("none", "left", "right")),
-    "freeway": Game("freeway:MinFreeway", 7, ("none", "up", "down")),
+    "freeway": Game("freeway:MinFreeway", 7, ("none", "up", "down"), longest=2_500),
     # Not one of the paper's games. Surfacing with six divers pays up to 10; a shot may hit in the same step.
     "seaquest": Game(
         "seaquest:MinSeaquest", 10, ("none", "left", "up", "right", "down", "fire"), tuple(map(float, range(12)))
@@ -62,6 +64,8 @@ def spec(name: str) -> EnvironmentSpec:
         num_actions=len(game.actions),
         reward_classes=game.rewards,
         package="gymnax",
+        ranges=(("length", 1, game.longest),),
+        step_rewards=(game.rewards[0], game.rewards[-1]),
     )
 
 

@@ -15,6 +15,7 @@ import pandas as pd
 from suite import registry
 from suite.configuration.overrides import dotted
 from suite.configuration.schema import Config, hash_of
+from suite.interface.environment import EnvironmentSpec
 from suite.records.record import RunRecord, episode_columns, protocol
 from suite.runtime.errors import UserError
 
@@ -30,6 +31,7 @@ FREE = (
 )
 # What a leaderboard keeps of a run's folder.
 EVIDENCE = ("config.json", "record.json", "episodes.csv", "evaluations.csv", "metrics.csv", "timing.csv")
+ROUNDING = 1e-3  # of sums of float32
 NOT_RANKED = "smoke"  # a preset for tests
 
 
@@ -149,6 +151,8 @@ def _episode_reasons(record: RunRecord) -> Iterator[str]:
     if (episodes["length"] < 1).any():
         yield "episodes.csv has episodes of no length"
     spec = record.spec
+    yield from _time_reasons(episodes, record.config, spec)
+    yield from impossible(episodes, spec)
     if spec.achievements:
         unlocked = episodes[list(spec.achievements)]
         if not unlocked.isin([0, 1]).all(axis=None):
@@ -159,6 +163,40 @@ def _episode_reasons(record: RunRecord) -> Iterator[str]:
     scores = registry.task(record.config.task).scores()(episodes, record.config, spec)
     if missing := [name for name, value in scores.items() if not math.isfinite(value)]:
         yield f"no episode counts for {', '.join(missing)}"
+
+
+def _time_reasons(episodes: pd.DataFrame, config: Config, spec: EnvironmentSpec) -> Iterator[str]:
+    """Environments play side by side, a step of each at a time: there must have been time for every episode."""
+    if spec.chance_outcomes:  # its events belong to an episode's length, and are no steps
+        return
+    step, length = episodes["step"].to_numpy(), episodes["length"].to_numpy()
+    if (early := length * config.environment.num_envs > step).any():
+        row = int(np.flatnonzero(early)[0])
+        yield f"episodes.csv line {row + 2}: {length[row]:,} steps long, and ends before it can have begun"
+    elif (crowded := np.cumsum(length) > step).any():
+        row = int(np.flatnonzero(crowded)[0])
+        yield f"episodes.csv line {row + 2}: the episodes so far have more steps than were taken, {step[row]:,}"
+
+
+def impossible(episodes: pd.DataFrame, spec: EnvironmentSpec) -> Iterator[str]:
+    """What the rules of the game do not allow."""
+    ranges = spec.ranges
+    if spec.two_player:  # pays once, at the end
+        ranges += (("return", spec.reward_classes[0], spec.reward_classes[-1]),)
+    limits: dict[str, tuple[Any, Any]] = {name: (low, high) for name, low, high in ranges}
+    if spec.step_rewards is not None:
+        least, most = spec.step_rewards
+        limits["return"] = (least * episodes["length"], most * episodes["length"])
+    for name, (least, most) in limits.items():
+        column = episodes[name]
+        if (wrong := (column < least - ROUNDING) | (column > most + ROUNDING)).any():
+            row = int(np.flatnonzero(wrong)[0])
+            low, high = (np.broadcast_to(limit, len(column))[row] for limit in (least, most))
+            yield f"episodes.csv line {row + 2}: {name} is {column.iloc[row]:g}, {spec.id} allows {low:g} to {high:g}"
+    parts = [episodes[name] for name in spec.return_parts]
+    if parts and (wrong := ~np.isclose(sum(parts), episodes["return"], atol=ROUNDING)).any():
+        row = int(np.flatnonzero(wrong)[0])
+        yield f"episodes.csv line {row + 2}: return is not the sum of {' and '.join(spec.return_parts)}"
 
 
 def _iteration_reasons(record: RunRecord, episodes: pd.DataFrame) -> Iterator[str]:

@@ -55,7 +55,20 @@ FURTHER_ACHIEVEMENTS = (
 )
 
 
-def _spec(id: str, pixels: tuple[int, int, int], tile: int, actions: int, rewards: dict[str, float]) -> EnvironmentSpec:
+START_HEALTH = 9
+HEALTH_REWARD = 0.1  # per point of health gained or lost
+
+
+def _spec(
+    id: str,
+    pixels: tuple[int, int, int],
+    tile: int,
+    actions: int,
+    rewards: dict[str, float],
+    longest: int,
+    most_health: int,
+) -> EnvironmentSpec:
+    """`longest`: steps after which an episode is cut off; `most_health`: the most points that a player can have."""
     return EnvironmentSpec(
         id=id,
         observation=ObservationSpec(shape=pixels, high=255, kind="pixels", patch=(tile, tile)),
@@ -66,21 +79,26 @@ def _spec(id: str, pixels: tuple[int, int, int], tile: int, actions: int, reward
         statistics=(("achievements", (len(rewards),)), ("achievement_return", ()), ("health_return", ())),
         package="craftax",
         light_changes=True,
+        ranges=(
+            ("length", 1, longest),
+            ("health_return", -HEALTH_REWARD * START_HEALTH, HEALTH_REWARD * (most_health - START_HEALTH)),
+        ),
+        return_parts=("achievement_return", "health_return"),
     )
 
 
 _CLASSIC = dict.fromkeys(CLASSIC_ACHIEVEMENTS, 1.0)
-CLASSIC_SPEC = _spec("craftax_classic", (63, 63, 3), 7, 17, _CLASSIC)
+CLASSIC_SPEC = _spec("craftax_classic", (63, 63, 3), 7, 17, _CLASSIC, longest=10_000, most_health=START_HEALTH)
 FULL_SPEC = _spec(
     "craftax_full",
     (130, 110, 3),
     10,
     43,
     _CLASSIC | {name: reward for reward, names in FURTHER_ACHIEVEMENTS for name in names},
+    longest=100_000,
+    most_health=13,  # of the strongest player
 )
 
-START_HEALTH = 9
-HEALTH_REWARD = 0.1  # per point of health gained or lost
 NO_LIMIT = 2**31 - 1
 
 

@@ -40,8 +40,17 @@ Progress = Callable[[str, float], None]
 
 
 def _specification(
-    name: str, symbols: int, high: int, actions: int, outcomes: int, rewards: tuple[float, ...], fully_observed: bool
+    name: str,
+    symbols: int,
+    high: int,
+    actions: int,
+    outcomes: int,
+    rewards: tuple[float, ...],
+    fully_observed: bool,
+    utility: tuple[float, float],
+    longest: int,
 ) -> EnvironmentSpec:
+    """`utility`: the least and the most that a game pays a player; `longest`: events that it has at most."""
     return EnvironmentSpec(
         id=f"openspiel/{name}",
         observation=ObservationSpec(shape=(symbols,), high=high, kind="symbols"),
@@ -52,15 +61,16 @@ def _specification(
         two_player=True,
         chance_outcomes=outcomes,
         fully_observed=fully_observed,
+        ranges=(("length", 1, longest), ("raw_return", *utility), ("seat", 1, 2)),
     )
 
 
 SPECS = {
-    "tic_tac_toe": _specification("tic_tac_toe", 27, 1, 9, 0, SIGNS, True),
+    "tic_tac_toe": _specification("tic_tac_toe", 27, 1, 9, 0, SIGNS, True, (-1.0, 1.0), 9),
     "leduc": _specification(
-        "leduc", 16, 13, 3, 6, SIGNS, False
+        "leduc", 16, 13, 3, 6, SIGNS, False, (-13.0, 13.0), 11
     ),  # pays -13..13, learned from the sign: fidelity note 32
-    "bargaining": _specification("bargaining", 93, 1, 121, 1002, tuple(map(float, range(11))), False),
+    "bargaining": _specification("bargaining", 93, 1, 121, 1002, tuple(map(float, range(11))), False, (0.0, 10.0), 19),
 }
 
 
@@ -281,6 +291,7 @@ def _specified(name: str, tables: Tables | None) -> EnvironmentSpec:
 def measured(name: str, tables: Tables) -> EnvironmentSpec:
     """What a game's tables say that it is."""
     levels = tuple(float(level) for level in np.union1d(tables.return_2N[:, tables.num_open :], [0.0]))
+    game = _engine(name)
     return _specification(
         name,
         symbols=tables.observation_2NO.shape[-1],
@@ -288,7 +299,9 @@ def measured(name: str, tables: Tables) -> EnvironmentSpec:
         actions=tables.next_DA.shape[-1],
         outcomes=tables.chance_KC.shape[-1],
         rewards=levels if len(levels) <= MAX_REWARD_CLASSES else SIGNS,
-        fully_observed=_fully_observed(_engine(name)),
+        fully_observed=_fully_observed(game),
+        utility=(game.min_utility(), game.max_utility()),
+        longest=game.max_history_length(),
     )
 
 
@@ -298,7 +311,17 @@ def measured_by_play(name: str) -> EnvironmentSpec:
     game = _engine(name)
     symbols = int(np.prod(game.observation_tensor_shape()))
     actions, outcomes = game.num_distinct_actions(), game.max_chance_outcomes()
-    known = _specification(name, symbols, 1, actions, outcomes, SIGNS, _fully_observed(game))
+    known = _specification(
+        name,
+        symbols,
+        1,
+        actions,
+        outcomes,
+        SIGNS,
+        _fully_observed(game),
+        (game.min_utility(), game.max_utility()),
+        min(game.max_history_length(), host.LIMIT),
+    )
     try:
         return host.measured(game, known)
     except game_tables.NotCategoricalError:

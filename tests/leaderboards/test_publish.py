@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from leaderboards.boards import COLUMNS
-from leaderboards.qualification import EVIDENCE
+from leaderboards.qualification import EVIDENCE, impossible
 from suite.records import record
 from suite.records.record import RunRecord, run_folder
 from suite.registry import resolve, task
@@ -40,7 +40,10 @@ def write(
     config = resolve(task_id, agent, preset, overrides, seed)
     with RunRecord.create(run_folder(Path(out), config), config, task(task_id).spec()) as run:
         ends = np.linspace(0, config.total_steps, len(returns) + 1).astype(int)[1:]
-        rows = [{"step": int(end), "return": value, "length": 5} for end, value in zip(ends, returns, strict=True)]
+        rows = [
+            {"step": int(end), "return": value, "length": max(5, math.ceil(value))}
+            for end, value in zip(ends, returns, strict=True)
+        ]
         run.append_episodes(rows)
         count = {"episodes": len(rows), "return": float(np.mean(returns)) if returns else None}
         run.append_metrics({"step": config.total_steps, **count})
@@ -184,6 +187,16 @@ REFUSALS = {
     "order": (swap(EPISODES, "51200,", "102401,"), "steps out of order, or outside 1 to 102,400"),
     "another return": (swap(EPISODES, ",3.0,", ",4.0,"), "2.5 in episodes.csv, 2 in metrics.csv"),
     "an episode less": (swap(EPISODES, "51200,1.0,5\n", ""), "1 episodes, metrics.csv counted 2"),
+    "too much for its length": (
+        swap(EPISODES, ",3.0,", ",9.0,"),
+        "line 3: return is 9, minatar/breakout allows 0 to 5",
+    ),
+    "too long": (swap(EPISODES, ",3.0,5", ",3.0,1001"), "line 3: length is 1001, minatar/breakout allows 1 to 1000"),
+    "no time": (swap(EPISODES, "51200,1.0,5", "32,1.0,5"), "line 2: 5 steps long, and ends before it can have begun"),
+    "too many": (
+        put(EPISODES, b"step,return,length\n" + b"3200,1.0,200\n" * 17),
+        "line 18: the episodes so far have more steps than were taken, 3,200",
+    ),
     "no episodes": (lambda folder: (folder / EPISODES).unlink(), "cannot read episodes.csv"),
     "unreadable": (put(EPISODES, b"\xff\xfe\x00"), "cannot read episodes.csv"),
     "other metrics": (put(METRICS, b"step\n1\n"), "metrics.csv lacks episodes, return"),
@@ -196,6 +209,37 @@ REFUSALS = {
 def test_what_does_not_qualify_is_refused_with_its_reason(suite, damage, reason):
     damage(write())
     refused(suite("publish"), "refused runs/minatar/breakout/mfrl/small/seed_0: ", reason)
+
+
+@pytest.mark.parametrize(
+    ("task_id", "row", "problem"),
+    [
+        ("openspiel/leduc", {"return": 500, "raw_return": 500}, "raw_return is 500, openspiel/leduc allows -13 to 13"),
+        ("openspiel/leduc", {"return": 5}, "return is 5, openspiel/leduc allows -1 to 1"),
+        ("openspiel/leduc", {"seat": 3}, "seat is 3, openspiel/leduc allows 1 to 2"),
+        ("openspiel/tic_tac_toe", {"length": 10}, "length is 10, openspiel/tic_tac_toe allows 1 to 9"),
+        ("openspiel/bargaining", {"return": -1}, "return is -1, openspiel/bargaining allows 0 to 10"),
+        ("minatar/breakout", {"return": 1e6}, "return is 1e+06, minatar/breakout allows 0 to 100"),
+        ("minatar/freeway", {"length": 10_000_000}, "length is 1e+07, minatar/freeway allows 1 to 2500"),
+        ("craftax_classic", {"length": 10_001}, "length is 10001, craftax_classic allows 1 to 10000"),
+        ("craftax_classic", {"return": 22}, "return is not the sum of achievement_return and health_return"),
+        (
+            "craftax_classic",
+            {"health_return": 20, "return": 22},
+            "health_return is 20, craftax_classic allows -0.9 to 0",
+        ),
+        ("craftax_full", {"health_return": -2, "return": 2}, "health_return is -2, craftax_full allows -0.9 to 0.4"),
+    ],
+)
+def test_what_the_rules_do_not_allow_is_refused(task_id, row, problem):
+    spec = task(task_id).spec()
+    possible = {name: 0.0 for name, shape in spec.statistics if not shape} | {"return": 0.0, "length": 100}
+    if spec.two_player:
+        possible |= {"seat": 1.0, "length": 5}
+    if spec.achievements:
+        possible |= {"achievement_return": 2.0, "return": 2.0}
+    assert not [*impossible(pd.DataFrame([possible, possible]), spec)]
+    assert f"episodes.csv line 3: {problem}" in impossible(pd.DataFrame([possible, possible | row]), spec)
 
 
 def test_other_protocols_are_refused(suite):
@@ -329,7 +373,7 @@ def test_missing_and_foreign_files_are_found(suite):
     assert code == 1
     for line in (
         "overall.csv: cannot be read (No such file or directory)",
-        "minatar_breakout.csv: 5 rows, the evidence gives 4",
+        "minatar_breakout.csv: 6 rows, the evidence gives 5",
         "minatar_pong.csv: made from no evidence",
         "index.html: made from other tables: publish again with --page leaderboards",
     ):
