@@ -1,11 +1,12 @@
-"""`suite verify`: are published leaderboards what their evidence gives?"""
+"""`suite verify`: are published leaderboards what their evidence gives, and did those runs begin as it says?"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from suite.commands.printing import print_json
+from suite.commands.printing import make_reporter, print_json
+from suite.runtime.errors import UserError
 
 SUMMARY = "recompute every row of leaderboards from its evidence; exit code 1 if anything differs"
 DIFFERS = 1
@@ -13,17 +14,40 @@ DIFFERS = 1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="DIR", help="where `suite publish` wrote them")
+    parser.add_argument("--replay", action="store_true", help="also run each run's first iteration again, and compare")
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+    parser.add_argument("--runs", type=int, metavar="K", help="with --replay: only K of the runs, drawn at random")
 
 
 def execute(args: argparse.Namespace) -> int:
     from leaderboards.verification import verify
 
+    if args.runs is not None and (args.runs < 1 or not args.replay):
+        raise UserError("--runs needs --replay, and a number above 0")
     problems = verify(args.folder)
     for problem in problems:
         print(problem)
+    if args.replay:
+        problems += _replayed(args)
     print(
         f"{args.folder}: {len(problems)} differences" if problems else f"{args.folder}: all rows follow from evidence"
     )
     if args.json:
         print_json({"folder": str(args.folder), "problems": problems})
     return DIFFERS if problems else 0
+
+
+def _replayed(args: argparse.Namespace) -> list[str]:
+    """Differences between the beginnings of runs and their records; prints each as it is found."""
+    from leaderboards.publish import evidence_in
+    from leaderboards.replay import replay
+
+    problems, count = list[str](), 0
+    for path, differences in replay(evidence_in(args.folder)[0], args.runs, make_reporter(args.quiet)):
+        count += 1
+        for difference in differences:
+            problems.append(f"{path}: {difference}")
+            print(problems[-1], flush=True)
+    wrong = len({problem.split(":")[0] for problem in problems})
+    print(f"{count - wrong} of {count} runs begin as their records say")
+    return problems

@@ -17,6 +17,7 @@ from suite.agent.algorithm import first_programs, iterate, iteration_key, start_
 from suite.agent.phases import Agent
 from suite.agent.state import TrainState
 from suite.configuration.schema import Config
+from suite.interface.environment import EnvironmentSpec
 from suite.records import checkpoint
 from suite.records.record import RunRecord, disk_full_is_an_error, run_folder
 from suite.runs.evaluation import episode_rows, record_evaluation
@@ -95,6 +96,40 @@ def run(
         return _Training(config, agent_for(config, reporter), record, reporter, callbacks).run()
 
 
+class IterationLog:
+    """What the phases of one iteration gave.
+
+    Attributes:
+      steps: real steps taken by its end.
+      rows: of the episodes that ended in it, as in `episodes.csv`.
+      metrics: by name, as in `metrics.csv`.
+    """
+
+    def __init__(self, spec: EnvironmentSpec, steps: int):
+        self.spec, self.steps = spec, steps
+        self.rows: list[dict[str, Any]] = []
+        self.metrics: dict[str, Any] = {}
+
+    def add(self, phase: str, result: Any) -> dict[str, float]:
+        """Takes what a phase returned; its metrics, on the host, prefixed by the phase."""
+        if phase == "collect":
+            _, trajectory, log = result
+            log = jax.device_get(log)
+            self.rows, taken = episode_rows(log, self.spec, log.ended_TB, self.steps)
+            self.steps += taken
+            self.metrics["reward_per_step"] = float(trajectory.reward_TB.mean())
+            return {}
+        values = {f"{phase}/{name}": float(value) for name, value in jax.device_get(result[1]).items()}
+        self.metrics |= values
+        return values
+
+    def row(self) -> dict[str, Any]:
+        """The iteration's row of `metrics.csv`."""
+        returns = [row["return"] for row in self.rows]
+        first = {"reward_per_step": self.metrics["reward_per_step"], "episodes": len(returns)}
+        return {"step": self.steps, **first, "return": float(np.mean(returns)) if returns else None} | self.metrics
+
+
 class _Training:
     """The host's side of a run: phases in order, their metrics and timing, checkpoints, signals, callbacks."""
 
@@ -105,8 +140,7 @@ class _Training:
         self.callbacks = callbacks
         self.checkpoints = record.folder / "checkpoints"
         self.iteration = self.steps = 0
-        self.metrics: dict[str, Any] = {}  # of the present iteration
-        self.rows: list[dict[str, Any]] = []  # and the episodes that ended in it
+        self.log = IterationLog(agent.spec, 0)  # of the present iteration
         self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
         self.recorded_seconds: dict[str, float] = {}  # of those, what timing.csv has
         self.stop_requested = False
@@ -172,20 +206,17 @@ class _Training:
 
     def _iterate(self, state: TrainState) -> TrainState:
         """One iteration of Algorithm 1, and what it leaves in the record."""
-        self.metrics, self.rows = {}, []
+        self.log = IterationLog(self.agent.spec, self.steps)
         key = iteration_key(self.config.seed, self.iteration)
         self.iteration += 1
         state, _ = iterate(self.agent, state, key, self.steps, self._call)
-        self.record.append_episodes(self.rows)
-        returns = [row["return"] for row in self.rows]
-        mean_return = float(np.mean(returns)) if returns else None
-        summary = {"reward_per_step": self.metrics.pop("reward_per_step"), "episodes": len(returns)}
-        row = {"step": self.steps, **summary, "return": mean_return, **self.metrics}
+        self.record.append_episodes(self.log.rows)
+        row = self.log.row()
         self.record.append_metrics(row, self.agent.metric_names)
         self._record_timing()
-        self.reporter.update(self.steps, "", {} if mean_return is None else {"return": mean_return})
+        self.reporter.update(self.steps, "", {} if row["return"] is None else {"return": row["return"]})
         for callback in self.callbacks:
-            if callback(Iteration(self.steps, row, self.rows)):
+            if callback(Iteration(self.steps, row, self.log.rows)):
                 self.stop_requested = True
         return state
 
@@ -198,14 +229,8 @@ class _Training:
         with self._phase(phase):
             self.ahead.wait(phase)
             result = function(*arguments)
-            if phase == "collect":
-                _, trajectory, log = result
-                log = jax.device_get(log)
-                self.rows, taken = episode_rows(log, self.agent.spec, log.ended_TB, self.steps)
-                self.steps += taken
-                self.metrics["reward_per_step"] = float(trajectory.reward_TB.mean())
-            else:
-                self.metrics |= self._check(phase, result[1])
+            self._check(phase, self.log.add(phase, result))
+            self.steps = self.log.steps
         return result
 
     def _record_timing(self) -> None:
@@ -226,15 +251,13 @@ class _Training:
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
 
-    def _check(self, phase: str, metrics: dict[str, jax.Array]) -> dict[str, float]:
-        """Metrics on the host, prefixed by their phase; stops the run where a loss or gradient is not finite."""
-        values = {f"{phase}/{name}": float(value) for name, value in jax.device_get(metrics).items()}
+    def _check(self, phase: str, values: dict[str, float]) -> None:
+        """Stops the run where a loss or gradient is not finite."""
         for name, value in values.items():
             if not np.isfinite(value):
                 kept = checkpoint.latest_step(self.checkpoints)
                 where = "no checkpoint was saved yet" if kept is None else f"the checkpoint at step {kept:,} is kept"
                 raise RunError(f"{name} became {value} in phase {phase} at step {self.steps:,}; {where}")
-        return values
 
     def _evaluate(self, state: TrainState) -> None:
         """Plays whole episodes with the present policy, unless there are some of this step already."""

@@ -1,0 +1,109 @@
+"""`suite verify --replay`: whether runs began as their records say.
+
+Until its first iteration is over, nothing that a run has learned has acted. So its play there follows from its
+configuration and seed alone, on every machine, and what it learned from that play does but for rounding. A record that
+was copied from another seed, agent or game, or whose configuration was changed, begins otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from leaderboards.boards import Standing
+from suite.agent.algorithm import iterate, iteration_key, start_key
+from suite.configuration.schema import Config
+from suite.records.record import RunRecord
+from suite.runs.saved_model import agent_for
+from suite.runs.training import PART_OF, IterationLog
+from suite.runtime.reporting import Reporter
+
+PLAYED = ("reward_per_step", "episodes", "return")  # of metrics.csv: what play gave
+DREAMT = "imagine/"  # dreams are not replayed
+EXACT = 1e-5  # sums of float32 in another order
+# What was learned: rounding, which updates in float32 amplify; other settings differ by far more.
+LEARNED, NOTHING = 0.05, 1e-3
+
+
+def replay(standings: Sequence[Standing], runs: int | None, reporter: Reporter) -> Iterator[tuple[str, list[str]]]:
+    """Runs the first iteration of published runs again.
+
+    Args:
+      standings: what is published.
+      runs: how many of them, drawn anew each time; None: all.
+      reporter: where progress goes.
+
+    Yields:
+      where a run's evidence lies, and every difference, a line each.
+    """
+    chosen = [
+        (path.as_posix(), record)
+        for standing in standings
+        for path, record in zip(standing.paths, standing.entry.records, strict=True)
+    ]
+    if runs is not None and runs < len(chosen):
+        drawn = np.random.default_rng().choice(len(chosen), runs, replace=False)
+        chosen = [chosen[index] for index in sorted(drawn)]
+    for done, (path, record) in enumerate(chosen):
+        reporter.texture(f"Replaying {path}", done / len(chosen))
+        yield path, differences(record, first_iteration(record.config, reporter))
+    reporter.texture("Replayed", 1.0)
+
+
+def first_iteration(config: Config, reporter: Reporter) -> IterationLog:
+    """What a run's first iteration gives, but for dreams."""
+    agent = agent_for(config, reporter)
+    log = IterationLog(agent.spec, 0)
+
+    def call(phase: str, function: Any, *arguments: Any) -> Any:
+        result = function(*arguments)
+        if phase not in PART_OF:
+            log.add(phase, result)
+        return result
+
+    # Dreams come last, cost most to compile, and are of what was learned before them.
+    iterate(agent, agent.init(start_key(config.seed)), iteration_key(config.seed, 0), 0, call, lambda *_: 0)
+    return log
+
+
+def differences(record: RunRecord, log: IterationLog) -> list[str]:
+    """What a record says otherwise of its first iteration than a replay."""
+    episodes, metrics = record.episodes(), record.table("metrics")
+    first, row = metrics.iloc[0].to_dict(), log.row()
+    if first["step"] != log.steps:
+        return [f"its first iteration took {int(first['step']):,} steps, replayed {log.steps:,}"]
+    problems = _episodes(episodes[episodes["step"] <= log.steps], pd.DataFrame(log.rows, columns=list(episodes)))
+    for name, value in row.items():
+        if name == "step":
+            continue
+        if name not in metrics:
+            problems.append(f"metrics.csv lacks {name}")
+        elif not _alike(name, first[name], value):
+            problems.append(f"{name} is {first[name]:.6g}, replayed {math.nan if value is None else value:.6g}")
+    others = [name for name in map(str, metrics) if name not in row and not name.startswith(DREAMT)]
+    more = [name for name in others if not pd.isna(first[name])]
+    return [*problems, *(f"metrics.csv has {name}, which is not this agent's" for name in more)]
+
+
+def _episodes(recorded: pd.DataFrame, replayed: pd.DataFrame) -> list[str]:
+    """What the first iteration's episodes are otherwise."""
+    if len(recorded) != len(replayed):
+        return [f"{len(recorded)} episodes ended in its first iteration, replayed {len(replayed)}"]
+    for name in recorded:
+        a, b = recorded[name].to_numpy(float), replayed[name].to_numpy(float)
+        if not np.allclose(a, b, rtol=EXACT, atol=EXACT):
+            row = int(np.flatnonzero(~np.isclose(a, b, rtol=EXACT, atol=EXACT))[0])
+            return [f"episodes.csv line {row + 2}: {name} is {a[row]:g}, replayed {b[row]:g}"]
+    return []
+
+
+def _alike(name: str, recorded: float, value: float | None) -> bool:
+    """Whether a metric is what it was, as far as rounding allows."""
+    if value is None or pd.isna(recorded):
+        return value is None and pd.isna(recorded)
+    relative, absolute = (EXACT, EXACT) if name in PLAYED else (LEARNED, NOTHING)
+    return math.isclose(recorded, value, rel_tol=relative, abs_tol=absolute)
