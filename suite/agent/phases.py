@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from suite.agent import rollout as play
-from suite.agent.replay import Experience, Replay, ReplayState
+from suite.agent.replay import Eventful, Experience, Replay, ReplayState
 from suite.agent.state import TrainState
 from suite.configuration.schema import Config
 from suite.interface.batching import Batched
@@ -31,7 +31,7 @@ from suite.runtime.errors import UserError
 from suite.tokenizers.nearest_neighbor import NearestNeighborState, NearestNeighborTokenizer
 from suite.tokenizers.stream import build_tokenizer
 from suite.world_model import training as world_model_training
-from suite.world_model.ages import ages_of
+from suite.world_model.history import History, ages_of
 from suite.world_model.imagination import Dream, Past
 from suite.world_model.sequences import Sequences
 from suite.world_model.transformer import WorldModel
@@ -97,6 +97,11 @@ class Agent:
         return self.config.world_model.ages if self.config.world_model.enabled and self.tokens.spatial else 0
 
     @property
+    def told_of_pay(self) -> bool:
+        """Whether the world model is told how often each action has earned a reward."""
+        return bool(self.config.world_model.enabled and self.config.world_model.paid and self.tokens.spatial)
+
+    @property
     def past(self) -> int:
         """How many real frames before a dream's first one its world model is told of."""
         return max(self.config.imagination.context, self.ages)
@@ -136,7 +141,9 @@ class Agent:
     def new_replay(self) -> ReplayState:
         """An empty replay buffer, with room for the environments' states if dreams happen in the game."""
         lasting = self.lasting_tokenizer
-        return self.replay.init(self.spec, self.kept_state, lasting.tokens_per_frame if lasting else 0)
+        return self.replay.init(
+            self.spec, self.kept_state, lasting.tokens_per_frame if lasting else 0, self.told_of_pay
+        )
 
     @property
     def lasting_tokenizer(self) -> NearestNeighborTokenizer | None:
@@ -175,7 +182,7 @@ class Agent:
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def remember(self, replay: ReplayState, trajectory: ppo.Trajectory) -> ReplayState:
         """Step 1, second line: the real steps enter the replay buffer."""
-        return self.replay.add(replay, trajectory)
+        return self.replay.add(replay, trajectory, self.tokens.pays if self.told_of_pay else None)
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def learn(
@@ -243,9 +250,14 @@ class Agent:
             measured = model_state.measured + (new - model_state.measured) / plan.trust_window
             model_state = dataclasses.replace(model_state, measured=measured)
 
+        eventful = None
+        if config.event_share:
+            length = self.ages + config.sequence_length + 1
+            eventful = self.replay.eventful(replay, self.tokens.pays, length, skipped=self.ages)
+
         def update(model_state, key):
             sample_key, dropout_key = jax.random.split(key)
-            sequences = self.replayed_sequences(tokenizer, replay, sample_key)
+            sequences = self.replayed_sequences(tokenizer, replay, sample_key, eventful=eventful)
             model_state, metrics = world_model_training.update(
                 config,
                 self.world_model_optimizer,
@@ -271,18 +283,28 @@ class Agent:
         return model_state, metrics
 
     def replayed_sequences(
-        self, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array, recent: int = 0
+        self,
+        tokenizer: TokenizerState,
+        replay: ReplayState,
+        key: jax.Array,
+        recent: int = 0,
+        eventful: Eventful | None = None,
     ) -> Sequences:
         """A minibatch of replayed sequences of T_WM + 1 frames; with `recent`, of those that ended so lately."""
         config = self.config.world_model
         length = self.ages + config.sequence_length + 1
-        batch = self.replay.sample(replay, key, config.sequences // config.minibatches, length, recent)
+        number, weight_B = config.sequences // config.minibatches, None
+        if eventful is None:
+            batch = self.replay.sample(replay, key, number, length, recent)
+        else:
+            batch, weight_B = self.replay.sample_eventful(replay, key, number, length, eventful, config.event_share)
         coded = batch.coded
         tokens_BTL = (
             encode_frame(self.tokenizer, tokenizer, batch.observation, batch.turn) if coded is None else coded.tokens
         )
         age_BTL = ages_of(tokens_BTL, self.ages) if self.ages else None
-        batch, tokens_BTL, age_BTL = jax.tree.map(lambda x: x[:, self.ages :], (batch, tokens_BTL, age_BTL))
+        history_BT = History(age_BTL, batch.paid)
+        batch, tokens_BTL, history_BT = jax.tree.map(lambda x: x[:, self.ages :], (batch, tokens_BTL, history_BT))
         action_BT = batch.action if batch.turn is None else stream_action(batch.turn, batch.action)
         return Sequences(
             tokens_BTL=tokens_BTL,
@@ -291,7 +313,8 @@ class Agent:
             terminated_BT=batch.terminated[:, :-1],
             ended_BT=batch.first[:, 1:],
             turn_BT=batch.turn,
-            age_BTL=None if age_BTL is None else age_BTL[:, :-1],
+            history_BT=jax.tree.map(lambda x: x[:, :-1], history_BT),
+            weight_B=weight_B,
         )
 
     def measure_rewards(self, params: Any, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array) -> jax.Array:
@@ -383,8 +406,10 @@ class Agent:
             return game.resumed(start.state, start.observation, start.first, start.turn)
         before = jax.tree.map(lambda x: x[len(past.first) - 1 - self.past : -1], past)
         past_PBL, start_BL = (None if x.coded is None else x.coded.tokens for x in (before, start))
-        known = Past(before.observation, before.action, before.turn, past_PBL) if self.past else None
-        return self.dream_from(model, tokenizer, start.observation, start.turn, plan.horizon, known, start_BL)
+        known = Past(before.observation, before.action, before.turn, past_PBL, before.paid) if self.past else None
+        return self.dream_from(
+            model, tokenizer, start.observation, start.turn, plan.horizon, known, start_BL, start.paid
+        )
 
     def dream_from(
         self,
@@ -395,6 +420,7 @@ class Agent:
         horizon: int,
         past: Past | None = None,
         tokens_BL: jax.Array | None = None,
+        paid_BA: jax.Array | None = None,
     ) -> Dream:
         """The world model as an environment that starts at these frames (Algorithm 4).
 
@@ -405,6 +431,7 @@ class Agent:
           horizon: steps that it can take.
           past: the `self.past` real frames before these, if there are some to be told of.
           tokens_BL: the frames' tokens, if they are known.
+          paid_BA: how often each action had earned a reward there, for a model that is told; None: nothing was paid.
         """
         plan = self.config.imagination
         return Dream(
@@ -418,6 +445,7 @@ class Agent:
             turn_B,
             past=past,
             start_tokens_BL=tokens_BL,
+            start_paid_BA=paid_BA,
             context=plan.context,
             min_p=plan.min_p,
         )

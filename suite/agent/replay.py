@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import flashbax as fbx
@@ -19,6 +20,7 @@ from suite.interface.environment import EnvironmentSpec, State
 from suite.interface.turns import Turn
 from suite.policy.ppo import Trajectory
 from suite.tokenizers.nearest_neighbor import NearestNeighborState, NearestNeighborTokenizer
+from suite.world_model.history import next_paid, paid_before
 
 ReplayState = Any  # flashbax's TrajectoryBufferState
 
@@ -44,6 +46,7 @@ class Experience:
       turn: whose move it was and what was allowed; None for single-agent tasks.
       state: the environment's own state at the frame, for agents that dream in the true game; else None.
       coded: the frame's tokens, where those of a stored frame are kept (`Replay.code`); else None.
+      paid: uint8 [..., A]; how often each action had earned a reward in the episode, where that is kept; else None.
     """
 
     observation: jax.Array
@@ -54,6 +57,20 @@ class Experience:
     turn: Turn | None = None
     state: State = None
     coded: Coded | None = None
+    paid: jax.Array | None = None
+
+
+@struct.dataclass
+class Eventful:
+    """Which sequences of one length hold an event, by environment (E) and first step (L), the oldest step first.
+
+    Attributes:
+      holds_EL: bool.
+      rank_N: int32 [E * L]; how many do up to each, so that one of them can be drawn.
+    """
+
+    holds_EL: jax.Array
+    rank_N: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,13 +96,14 @@ class Replay:
             max_length_time_axis=self.length,
         )
 
-    def init(self, spec: EnvironmentSpec, state: State = None, tokens: int = 0) -> ReplayState:
+    def init(self, spec: EnvironmentSpec, state: State = None, tokens: int = 0, paid: bool = False) -> ReplayState:
         """An empty buffer.
 
         Args:
           spec: the task's.
           state: the shapes of one environment's state, where states are kept.
           tokens: L, where the tokens of frames are kept; else 0.
+          paid: whether it is kept how often each action had earned a reward.
         """
         step = Experience(
             observation=jnp.zeros(spec.observation.shape, jnp.uint8),
@@ -96,12 +114,18 @@ class Replay:
             turn=_no_turn(spec) if spec.two_player else None,
             state=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state),
             coded=_uncoded((tokens,)) if tokens else None,
+            paid=jnp.zeros(spec.num_actions, jnp.uint8) if paid else None,
         )
         # flashbax counts with Python's numbers, whose weak types a restored buffer does not have: another program each.
         return jax.tree.map(lambda x: x.astype(x.dtype), self._buffer(1, 1).init(step))
 
-    def add(self, state: ReplayState, trajectory: Trajectory) -> ReplayState:
-        """Appends a trajectory (time-major, [T, B]); the oldest steps give way. Its frames have no tokens yet."""
+    def add(
+        self, state: ReplayState, trajectory: Trajectory, pays: Callable[[jax.Array], jax.Array] | None = None
+    ) -> ReplayState:
+        """Appends a trajectory (time-major, [T, B]); the oldest steps give way. Its frames have no tokens yet.
+
+        `pays` tells of rewards, float32 of any shape, which of them count as paid, where that is kept.
+        """
         kept = state.experience.coded
         experience = Experience(
             observation=trajectory.observation_TB,
@@ -112,6 +136,7 @@ class Replay:
             turn=trajectory.turn_TB,
             state=trajectory.state_TB,
             coded=None if kept is None else _uncoded((*trajectory.action_TB.shape, kept.tokens.shape[-1])),
+            paid=None if state.experience.paid is None or pays is None else self._paid(state, trajectory, pays),
         )
         return self._buffer(1, 1).add(state, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), experience))
 
@@ -147,6 +172,12 @@ class Replay:
         coded = jax.lax.fori_loop(0, new, code, coded)
         return state.replace(experience=state.experience.replace(coded=coded))
 
+    def _paid(self, state: ReplayState, trajectory: Trajectory, pays: Callable[[jax.Array], jax.Array]) -> jax.Array:
+        """uint8 [T, B, A]: how often each action had earned a reward before each step of a trajectory that follows."""
+        newest = jax.tree.map(lambda x: x[:, (state.current_index - 1) % self.length], state.experience)
+        start_BA = next_paid(newest.paid, newest.action, pays(newest.reward))
+        return paid_before(start_BA, trajectory.action_TB, pays(trajectory.reward_TB), trajectory.first_TB)[0]
+
     def sample(self, state: ReplayState, key: jax.Array, batch: int, length: int, recent: int = 0) -> Experience:
         """`batch` sequences of `length` consecutive steps; leading axes [batch, length].
 
@@ -158,17 +189,72 @@ class Replay:
         with jax.numpy_rank_promotion("allow"):  # flashbax broadcasts as NumPy does
             return self._buffer(batch, length).sample(state, key).experience
 
+    def eventful(
+        self, state: ReplayState, pays: Callable[[jax.Array], jax.Array], length: int, skipped: int = 0
+    ) -> Eventful:
+        """Which sequences hold an event: a step that pays, or one that ends its episode by the rules.
+
+        Args:
+          state: the buffer.
+          pays: as for `add`.
+          length: of the sequences. The last step does not count: it only says what the others led to.
+          skipped: so many first steps do not count either.
+        """
+        oldest = self._oldest(state)
+        event_EL = pays(state.experience.reward) | state.experience.terminated
+        event_EL = jnp.roll(event_EL.astype(jnp.int32), -oldest, axis=1)
+        before_EL = jnp.pad(jnp.cumsum(event_EL, axis=1), ((0, 0), (1, 0)))
+        first_L = jnp.arange(self.length)
+        count_EL = before_EL[:, (first_L + length - 1) % self.length] - before_EL[:, (first_L + skipped) % self.length]
+        holds_EL = (count_EL > 0) & (first_L + length <= self._stored(state))[None]
+        return Eventful(holds_EL, jnp.cumsum(holds_EL.reshape(-1).astype(jnp.int32)))
+
+    def sample_eventful(
+        self, state: ReplayState, key: jax.Array, batch: int, length: int, eventful: Eventful, share: float
+    ) -> tuple[Experience, jax.Array]:
+        """As `sample`, but a share of the sequences is drawn among those that hold an event.
+
+        Args:
+          state, batch, length: as for `sample`.
+          key: of the draw.
+          eventful: which sequences of this length hold one.
+          share: how many, on average, are drawn among these, in [0, 1).
+
+        Returns:
+          the sequences, and float32 [B]: how much less or more often than by `sample` each of them is drawn, so that
+          means weighed by it are what they are there.
+        """
+        row_key, time_key, which_key, rank_key = jax.random.split(key, 4)
+        row_B = jax.random.randint(row_key, (batch,), 0, self.num_envs)
+        first_B = jax.random.randint(time_key, (batch,), 0, self._stored(state) - length + 1)
+        held = eventful.rank_N[-1]
+        drawn_B = jnp.searchsorted(eventful.rank_N, jax.random.randint(rank_key, (batch,), 1, jnp.maximum(held, 1) + 1))
+        wanted_B = (jax.random.uniform(which_key, (batch,)) < share) & (held > 0)
+        row_B = jnp.where(wanted_B, drawn_B // self.length, row_B)
+        first_B = jnp.where(wanted_B, drawn_B % self.length, first_B)
+        number = (self.num_envs * (self._stored(state) - length + 1)).astype(jnp.float32)
+        among = jnp.where(eventful.holds_EL[row_B, first_B], number / jnp.maximum(held, 1).astype(jnp.float32), 0.0)
+        weight_B = jnp.where(held > 0, 1 / (1 - share + share * among), 1.0)
+        return self._sequences(state, row_B, self._oldest(state) + first_B, length), weight_B
+
+    def _oldest(self, state: ReplayState) -> jax.Array:
+        """int32 scalar; where the oldest step stands."""
+        return jnp.where(state.is_full, state.current_index, 0)
+
     def _stored(self, state: ReplayState) -> jax.Array:
         """int32 scalar; steps that are stored of each environment."""
         return jnp.where(state.is_full, self.length, state.current_index)
 
     def _sample_recent(self, state: ReplayState, key: jax.Array, batch: int, length: int, recent: int) -> Experience:
         row_key, age_key = jax.random.split(key)
-        row_N = jax.random.randint(row_key, (batch,), 0, self.num_envs)
-        age_N = jax.random.randint(age_key, (batch,), 0, jnp.minimum(recent, self._stored(state) - length + 1))
-        first_N = state.current_index - length - age_N
-        time_NT = (first_N[:, None] + jnp.arange(length)[None]) % self.length
-        return jax.tree.map(lambda x: x[row_N[:, None], time_NT], state.experience)
+        row_B = jax.random.randint(row_key, (batch,), 0, self.num_envs)
+        age_B = jax.random.randint(age_key, (batch,), 0, jnp.minimum(recent, self._stored(state) - length + 1))
+        return self._sequences(state, row_B, state.current_index - length - age_B, length)
+
+    def _sequences(self, state: ReplayState, row_B: jax.Array, slot_B: jax.Array, length: int) -> Experience:
+        """Sequences [B, T] of these environments that begin in these slots, counted modulo the buffer's length."""
+        slot_BT = (slot_B[:, None] + jnp.arange(length)[None]) % self.length
+        return jax.tree.map(lambda x: x[row_B[:, None], slot_BT], state.experience)
 
 
 def _uncoded(shape: tuple[int, ...]) -> Coded:

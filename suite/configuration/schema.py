@@ -136,7 +136,7 @@ class WorldModelConfig:
     positions: Literal["flat", "grid"] = "flat"  # RoPE over the token index, or over (time, row, column): note 20
     # How attention is computed: plain operations, or one kernel for GPUs (suite/nn/fused_attention.py).
     attention: Literal["plain", "fused"] = "plain"
-    # This and the next six are not the paper's (docs/agents.md): copy tokens from near their place, or make them new.
+    # This and the next seven are not the paper's (docs/agents.md): copy tokens from near their place, or make them new.
     correspondence: bool = False
     correspondence_radius: NotNegative = 1  # of the square that is copied from; symbols: their own place alone
     # Numbers in a further embedding of the 3x3 tokens around each, of which its own embedding gets a sum; 0: none.
@@ -147,6 +147,9 @@ class WorldModelConfig:
     # The model is told every token's age, for how many steps its place has shown it, up to so many. 0: it is not told.
     # Only where tokens are patches: symbols of games that people play have no timers.
     ages: NotNegative = 0
+    # The model is told how often each action has earned a reward in the episode, counted up to so many. 0: it is not
+    # told. Where tokens are patches, as with ages.
+    paid: NotNegative = 0
     # Embeddings and logits of a code are its own and a linear map of the patch that it stands for.
     patch_contents: bool = False
     # Symbols are embedded by value and place, since the same value means different things in different places; the
@@ -155,6 +158,9 @@ class WorldModelConfig:
     reward_classes: tuple[float, ...] | None = None  # None: the task's levels
     mask_after_done: bool = False  # drop losses after an episode's end inside a sequence: note 21
     sequences: Positive = 48  # per update, over all minibatches (N_env in Algorithm 5)
+    # This share of the training sequences is drawn among those in which a reward is paid or an episode ends. The losses
+    # of rewards and ends are weighed so that they stay what they are on average. 0: all are drawn alike.
+    event_share: Rate = 0.0
     updates: NotNegative = 500  # N_TWM
     minibatches: Positive = 3
     reward_weight: NotNegativeFloat = 1.0  # of the reward and termination losses (MinAtar: 10)
@@ -315,6 +321,11 @@ def _problems(config: Config) -> Iterator[str]:
             f"imagination.trust_window={dream.trust_window} measures what imagination.trust=0 does not ask for, so it "
             "must be 0 too"
         )
+    if model.event_share and dream.trust and not dream.trust_window:
+        yield (
+            f"world_model.event_share={model.event_share} replays more rewards than there are: imagination.trust must "
+            "measure on new steps, with imagination.trust_window above 0"
+        )
     if dream.world == "game" and dream.trust:
         yield "imagination.world=game needs no trust, for its rewards are the true ones: imagination.trust=0"
     if dream.world == "model" and dream.context >= model.sequence_length:
@@ -331,7 +342,8 @@ def _problems(config: Config) -> Iterator[str]:
         yield "policy.kind=moon has no memory and an embedding: policy.rnn_size=0, and policy.embedding_size above 0"
     if model.patch_contents and config.tokenizer.kind != "nearest_neighbor":
         yield "world_model.patch_contents=true needs codes that are patches: tokenizer.kind=nearest_neighbor"
-    for name, used in (("correspondence=true", model.correspondence), (f"ages={model.ages}", model.ages)):
+    beyond = {"correspondence=true": model.correspondence, f"ages={model.ages}": model.ages}
+    for name, used in (beyond | {f"paid={model.paid}": model.paid}).items():
         if used and (not model.block_teacher_forcing or config.tokenizer.kind == "continuous"):
             yield (
                 f"world_model.{name} needs world_model.block_teacher_forcing=true and a tokenizer.kind whose "

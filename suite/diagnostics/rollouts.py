@@ -20,7 +20,7 @@ from flax import nnx
 from suite.agent.phases import Agent
 from suite.diagnostics.evaluation_set import STEPS, EvaluationSet
 from suite.interface.tokens import TokenizerState, TokenSpec
-from suite.world_model.ages import ages_of
+from suite.world_model.history import History, ages_of
 from suite.world_model.imagination import Past
 from suite.world_model.transformer import WorldModel
 
@@ -127,8 +127,8 @@ def _imagine(
     _, imagined = jax.lax.scan(step, start, (jax.random.split(key, horizon), action_NT[:, past:].T))
     tokens_NTL = agent.tokenizer.encode(tokenizer, frames_NTO)
     read = slice(past - context, -1)
-    age_NTL = ages_of(tokens_NTL, agent.ages)[:, read] if agent.ages else None
-    hidden = _hidden_states(model, tokens_NTL[:, read], action_NT[:, past - context :], age_NTL)[:, context:]
+    history_NT = History(ages_of(tokens_NTL, agent.ages)[:, read] if agent.ages else None)
+    hidden = _hidden_states(model, tokens_NTL[:, read], action_NT[:, past - context :], history_NT)[:, context:]
     tokens_NTL = tokens_NTL[:, past:]
     copied_NT = jnp.zeros(hidden.shape[:2])
     if model.gate_head is not None:
@@ -143,12 +143,10 @@ def _imagine(
     )
 
 
-def _hidden_states(
-    model: WorldModel, tokens_NTL: jax.Array, action_NT: jax.Array, age_NTL: jax.Array | None
-) -> jax.Array:
+def _hidden_states(model: WorldModel, tokens_NTL: jax.Array, action_NT: jax.Array, history_NT: History) -> jax.Array:
     """The model's hidden states [N, T, S, D] of real frames, of which it reads the latest at each, as in a dream."""
     cache = model.init_cache(len(action_NT), min(action_NT.shape[1], model.config.sequence_length))
-    steps = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (tokens_NTL, action_NT, age_NTL))
+    steps = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (tokens_NTL, action_NT, history_NT))
     _, hidden_TNSD = jax.lax.scan(lambda cache, step: model.step(cache, *step), cache, steps)
     return jnp.swapaxes(hidden_TNSD, 0, 1)
 

@@ -56,6 +56,10 @@ class TokenSpec:
         """float32 reward level of each class index."""
         return jnp.asarray(self.reward_classes, jnp.float32)[index]
 
+    def pays(self, reward: jax.Array) -> jax.Array:
+        """bool: whether the level nearest to each reward is above 0."""
+        return self.class_to_reward(self.reward_to_class(reward)) > 0
+
 
 class Tokenizer(Protocol):
     """Turns observations into tokens and back. Pure: its state is a pytree that callers carry.

@@ -310,6 +310,8 @@ AGENTS = (
             ("games", "whose world model learns games of two players as fast as all else"),
             ("average", "that dreams with the newest parameters"),
             ("codes", "with the codebook of m5 on Craftax"),
+            ("events", "that learns of Craftax's rewards as seldom as they come"),
+            ("paid", "that does not know what a Craftax episode has paid already"),
             ("trust", "that dreams whatever its model knows of rewards"),
         )
     ),

@@ -23,6 +23,7 @@ from flax import struct
 
 from suite.nn.sampling import draw
 from suite.world_model.heads import filled_odds
+from suite.world_model.history import History
 from suite.world_model.sequences import Sequences
 
 Cache = Any  # A model's own pytree of arrays: what it remembers of the blocks before.
@@ -53,7 +54,7 @@ class Lesson:
       target_BFL: the tokens that the observation logits are of.
       before_BFL: what stood at a target's place one frame earlier: where it differs, the token has changed.
       weight_BFL: float32, 0 or 1; whether a target counts.
-      age_BFL: int32; ages of the tokens that are read, for a model that is told them; else None.
+      history_BF: of the frames that are read, for a model that is told something; else None.
     """
 
     frame_BFL: jax.Array
@@ -61,7 +62,7 @@ class Lesson:
     target_BFL: jax.Array
     before_BFL: jax.Array
     weight_BFL: jax.Array
-    age_BFL: jax.Array | None = None
+    history_BF: History | None = None
 
 
 class Factorization(Protocol):
@@ -135,7 +136,7 @@ class BlockParallel:
             target_BFL=self.targets(frame, following),
             before_BFL=frame,
             weight_BFL=jnp.broadcast_to(token_weight_BT[..., None], frame.shape[:3]),
-            age_BFL=sequences.age_BTL,
+            history_BF=sequences.history_BT,
         )
 
     def sample(

@@ -6,6 +6,7 @@ import jax
 from flax import struct
 
 from suite.interface.turns import Turn
+from suite.world_model.history import History
 
 
 @struct.dataclass
@@ -19,7 +20,8 @@ class Sequences:
       terminated_BT: bool; the episode ended there, and frame t + 1 belongs to the next one.
       ended_BT: bool; terminated or truncated; None: terminated. Only `mask_after_done` looks at it.
       turn_BT: whose turn it is at each of the T + 1 frames; None for single-agent tasks.
-      age_BTL: int32 [B, T, L]; ages of all tokens but the last frame's, for a model that is told them; else None.
+      history_BT: of all frames but the last, for a model that is told something; else None.
+      weight_B: float32; of what each sequence's rewards and ends teach, 1 on average. None: 1.
     """
 
     tokens_BTL: jax.Array
@@ -28,4 +30,5 @@ class Sequences:
     terminated_BT: jax.Array
     ended_BT: jax.Array | None = None
     turn_BT: Turn | None = None
-    age_BTL: jax.Array | None = None
+    history_BT: History | None = None
+    weight_B: jax.Array | None = None

@@ -140,7 +140,7 @@ def losses(
     """
     step_weight_BT, token_weight_BT = _weights(sequences, config.mask_after_done)
     lesson = model.factorization.lesson(sequences, token_weight_BT)
-    hidden_BFSD = model(lesson.frame_BFL, lesson.action_BF, dropout_key, lesson.age_BFL)
+    hidden_BFSD = model(lesson.frame_BFL, lesson.action_BF, dropout_key, lesson.history_BF)
     token_loss_BFL, correct_BFL, copied_BFL = _token_losses(model, hidden_BFSD, lesson.target_BFL, lesson.frame_BFL)
     changed_BFL = (lesson.before_BFL != lesson.target_BFL).reshape(*lesson.weight_BFL.shape, -1).any(-1)
     hidden_BTSD = hidden_BFSD[:, : sequences.action_BT.shape[1]]
@@ -152,13 +152,18 @@ def losses(
     termination_loss_BT, _ = cross_entropy(
         model.termination_logits(hidden_BTSD), sequences.terminated_BT.astype(jnp.int32)
     )
+
+    def weighed(value_BT: jax.Array) -> jax.Array:
+        """Not divided by the weights' sum: that would weigh the sequences of one minibatch against each other alone."""
+        return value_BT if sequences.weight_B is None else value_BT * sequences.weight_B[:, None]
+
     metrics = {
         "observation_loss": masked_mean(token_loss_BFL, lesson.weight_BFL),
         "token_accuracy": masked_mean(correct_BFL, lesson.weight_BFL),
         "changed_token_accuracy": masked_mean(correct_BFL, lesson.weight_BFL * changed_BFL.astype(jnp.float32)),
-        "reward_loss": masked_mean(reward_loss_BT, step_weight_BT),
-        "reward_accuracy": masked_mean(reward_correct_BT, step_weight_BT),
-        "termination_loss": masked_mean(termination_loss_BT, step_weight_BT),
+        "reward_loss": masked_mean(weighed(reward_loss_BT), step_weight_BT),
+        "reward_accuracy": masked_mean(weighed(reward_correct_BT), step_weight_BT),
+        "termination_loss": masked_mean(weighed(termination_loss_BT), step_weight_BT),
     }
     if model.gate_head is not None:
         metrics["copied_share"] = masked_mean(copied_BFL, lesson.weight_BFL)

@@ -27,6 +27,7 @@ from suite.world_model.attention import cached_attention, causal_attention, held
 from suite.world_model.block_teacher_forcing import factorization
 from suite.world_model.correspondence import OUTSIDE, inside, mixture_odds, neighbourhood
 from suite.world_model.heads import Head, PlaceHead, SymbolsHead, TurnHead, TurnLogits, filled_odds
+from suite.world_model.history import History
 
 TERMINATION_CLASSES = 2
 
@@ -148,6 +149,14 @@ class WorldModel(nnx.Module):
         self.termination_places = _place_head(config, tokens, TERMINATION_CLASSES, self.dtype, rngs)
         self.ages = config.ages if tokens.spatial else 0
         self.age_embedding = nnx.Embed(self.ages + 1, width, embedding_init=init, rngs=rngs) if self.ages else None
+        # Of what the episode has paid: all of it, and what it has paid for the action that is taken now.
+        paid = config.paid if tokens.spatial else 0
+        self.paid_embedding = (
+            nnx.Linear(tokens.num_actions, width, use_bias=False, dtype=self.dtype, kernel_init=init, rngs=rngs)
+            if paid
+            else None
+        )
+        self.again_embedding = nnx.Embed(paid + 1, width, embedding_init=init, rngs=rngs) if paid else None
         # What codes stand for, and what embeddings and logits make of it: nothing before training.
         content = tokens.content_size if config.patch_contents else 0
         self.contents = Contents(jnp.zeros((codes, content), jnp.float32)) if content else None
@@ -162,17 +171,17 @@ class WorldModel(nnx.Module):
         tokens_BTL: jax.Array,
         action_BT: jax.Array,
         dropout_key: jax.Array | None = None,
-        age_BTL: jax.Array | None = None,
+        history_BT: History | None = None,
     ) -> jax.Array:
         """Hidden states [B, T, S, D] (float32) of whole sequences; without `dropout_key` nothing is dropped.
 
-        Here and below, `age_BTL` are the tokens' ages, for a model that is told them.
+        Here and below, the history is for a model that is told something of it.
         """
         batch, steps = action_BT.shape
         rate = self.config.dropout
         embedding_key, layer_key = _split(dropout_key, 2)
         # All tokens along one axis: on a CPU, a bias's gradient, a sum over two axes, takes several times as long.
-        x = self.embed(tokens_BTL, action_BT, age_BTL).reshape(batch * steps * self.block, -1)
+        x = self.embed(tokens_BTL, action_BT, history_BT).reshape(batch * steps * self.block, -1)
         position_SA = self._positions(jnp.arange(steps * self.block))
         graphdef, layers = nnx.split(self.layers)
 
@@ -263,16 +272,16 @@ class WorldModel(nnx.Module):
         return Cache(jnp.zeros(shape, self.dtype), jnp.zeros(shape, self.dtype), jnp.int32(0))
 
     def step(
-        self, cache: Cache, tokens_BL: jax.Array, action_B: jax.Array, age_BL: jax.Array | None = None
+        self, cache: Cache, tokens_BL: jax.Array, action_B: jax.Array, history_B: History | None = None
     ) -> tuple[Cache, jax.Array]:
         """Appends one block to the cache; its hidden states [B, S, D] equal those of the whole sequence's pass."""
-        return self._append(cache, self.embed(tokens_BL, action_B, age_BL))
+        return self._append(cache, self.embed(tokens_BL, action_B, history_B))
 
     def remember(
-        self, cache: Cache, tokens_BCL: jax.Array, action_BC: jax.Array, age_BCL: jax.Array | None = None
+        self, cache: Cache, tokens_BCL: jax.Array, action_BC: jax.Array, history_BC: History | None = None
     ) -> Cache:
         """Appends C blocks to an empty cache that has room for them, all at once."""
-        x_BCSD = self.embed(tokens_BCL, action_BC, age_BCL)
+        x_BCSD = self.embed(tokens_BCL, action_BC, history_BC)
         cache, _ = self._append(cache, x_BCSD.reshape(len(x_BCSD), -1, x_BCSD.shape[-1]))
         return cache
 
@@ -322,7 +331,8 @@ class WorldModel(nnx.Module):
             return None
         return jax.lax.stop_gradient(self.contents[...]) @ reading[...]
 
-    def embed(self, tokens: jax.Array, action: jax.Array, age: jax.Array | None) -> jax.Array:
+    def embed(self, tokens: jax.Array, action: jax.Array, history: History | None) -> jax.Array:
+        history = history or History()
         if self.codes_per_place:
             places = self.codes_per_place * jnp.arange(tokens.shape[-1])
             tokens = tokens + places.reshape((1,) * (tokens.ndim - 1) + (-1,))
@@ -333,9 +343,15 @@ class WorldModel(nnx.Module):
             x = x + self.local_mix(around.reshape(*tokens.shape, -1))
         if self.token_action_embedding is not None:
             x = x + self.token_action_embedding(action)[..., None, :]
-        if self.age_embedding is not None and age is not None:
-            x = x + self.age_embedding(age)
-        return jnp.concatenate([x, self.action_embedding(action)[..., None, :]], axis=-2)
+        if self.age_embedding is not None and history.age is not None:
+            x = x + self.age_embedding(history.age)
+        block = jnp.concatenate([x, self.action_embedding(action)[..., None, :]], axis=-2)
+        if self.paid_embedding is not None and self.again_embedding is not None and history.paid is not None:
+            count = jnp.minimum(history.paid, self.config.paid)
+            told = self.paid_embedding(jnp.sqrt(count.astype(jnp.float32)))  # the first counts most
+            again = jnp.take_along_axis(count, action[..., None], axis=-1)[..., 0].astype(jnp.int32)
+            block = block + (told + self.again_embedding(again))[..., None, :]
+        return block
 
 
 def _place_head(

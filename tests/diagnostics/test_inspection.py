@@ -22,7 +22,7 @@ from suite.registry import Lazy
 from suite.runs.saved_model import SavedModel, agent_for, restore
 from suite.runtime.errors import UserError
 from suite.runtime.reporting import QuietReporter
-from suite.world_model.ages import ages_of
+from suite.world_model.history import History, ages_of
 from tests.tiny import CORRIDOR, PENNIES, Corridor
 
 QUIET = QuietReporter()
@@ -192,7 +192,7 @@ def test_a_model_that_knows_what_came_before(tmp_path):
     whole = nnx.merge(run.agent.world_model_graph, model)
     age_NTL = ages_of(tokens_NTL, run.agent.ages)
     shown = slice(past, past + found.steps)
-    hidden = whole(tokens_NTL[:, shown], real.action[:, shown], age_BTL=age_NTL[:, shown])
+    hidden = whole(tokens_NTL[:, shown], real.action[:, shown], history_BT=History(age_NTL[:, shown]))
     np.testing.assert_allclose(found.reward_odds, jax.nn.softmax(whole.reward_logits(hidden)), rtol=1e-4, atol=1e-6)
     np.testing.assert_array_equal(
         found.tokenized, run.agent.tokenizer.decode(tokenizer, tokens_NTL[:, past : past + found.steps + 1])

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
+from suite.world_model.ages import History, ages_of, next_ages
 
 from suite import registry
 from suite.runtime.errors import UserError
 from suite.world_model import training
-from suite.world_model.ages import ages_of, next_ages
 from suite.world_model.sequences import Sequences
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import GRID, SPEC, small_config, small_model
@@ -48,7 +48,9 @@ def test_learning_a_timer_by_muon():
         tokens_BTL = (first_BL[:, None] + time_BT[..., None] // PERIOD) % 2
         none = jnp.zeros((16, 1))
         age_BTL = ages_of(tokens_BTL, LIMIT)[:, LIMIT:-1]
-        return Sequences(tokens_BTL[:, LIMIT:], none.astype(jnp.int32), none, none.astype(bool), age_BTL=age_BTL)
+        return Sequences(
+            tokens_BTL[:, LIMIT:], none.astype(jnp.int32), none, none.astype(bool), history_BT=History(age_BTL)
+        )
 
     def update(model_state, key):
         return training.update(config, optimizer, graph, SPEC, model_state, batch(key), key)

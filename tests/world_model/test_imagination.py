@@ -17,8 +17,8 @@ from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeSt
 from suite.nn.sampling import draw
 from suite.tokenizers.nearest_neighbor import NearestNeighborTokenizer
 from suite.world_model import training
-from suite.world_model.ages import ages_of
 from suite.world_model.heads import filled_odds
+from suite.world_model.history import History, ages_of
 from suite.world_model.imagination import Dream, Past
 from suite.world_model.sequences import Sequences
 from suite.world_model.transformer import WorldModel
@@ -227,10 +227,10 @@ def test_dreams_know_how_old_tokens_are(learned, context):
     for t in (4, 5):
         state, _ = dream.step(jax.random.key(t), state, action[t])
         shown.append(state.tokens_BL)
-    _, hidden = model.step(state.cache, state.tokens_BL, action[6], state.age_BL)
+    _, hidden = model.step(state.cache, state.tokens_BL, action[6], state.history_B)
     tokens_BTL, action_BT = jnp.stack(shown, axis=1), action.swapaxes(0, 1)
     age_BTL, read = ages_of(tokens_BTL, 3), slice(4 - context, 7)
-    whole = model(tokens_BTL[:, read], action_BT[:, read], age_BTL=age_BTL[:, read])
+    whole = model(tokens_BTL[:, read], action_BT[:, read], history_BT=History(age_BTL[:, read]))
     np.testing.assert_allclose(hidden, whole[:, -1], atol=1e-4)
-    untold = model(tokens_BTL[:, read], action_BT[:, read], age_BTL=0 * age_BTL[:, read])
+    untold = model(tokens_BTL[:, read], action_BT[:, read], history_BT=History(0 * age_BTL[:, read]))
     assert abs(whole - untold).max() > 0.1
