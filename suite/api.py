@@ -31,6 +31,7 @@ from suite.runs.training import Callback
 from suite.runtime.compilation import enable_compilation_cache, quiet_xla, refuse_other_arithmetic
 from suite.runtime.errors import UserError
 from suite.runtime.reporting import QuietReporter, Reporter, RichReporter
+from suite.world_model.history import MOST
 from suite.world_model.imagination import Past
 
 
@@ -279,6 +280,7 @@ class Dreamer:
         frames: np.ndarray,
         actions: np.ndarray,
         before: tuple[np.ndarray, np.ndarray] | None = None,
+        paid: np.ndarray | None = None,
         seed: int = 0,
     ) -> Imagined:
         """What happens if these actions are taken from these frames on.
@@ -289,6 +291,8 @@ class Dreamer:
           before: the P frames before those, uint8 [B, P, *spec.observation.shape], oldest first, and the actions taken
             on them, int [B, P]. A model that is told what happened earlier (m6's ages) dreams worse without them; P
             must be at least what it is told, `needs`.
+          paid: int [B, A]; how often each action has earned a reward in the episode, for a model that is told (m6's on
+            Craftax). None: nothing was paid yet.
           seed: of what is drawn.
 
         Raises:
@@ -318,6 +322,12 @@ class Dreamer:
                 jnp.asarray(earlier[:, steps - self.needs :].swapaxes(0, 1)),
                 jnp.asarray(taken[:, steps - self.needs :].T),
             )
+        paid_BA = None
+        if paid is not None:
+            paid_BA = jnp.asarray(np.atleast_2d(np.asarray(paid)).clip(0, MOST), jnp.uint8)
+            if paid_BA.shape != (len(frames_BO), most + 1):
+                expected = [len(frames_BO), most + 1]
+                raise UserError(f"paid has shape {list(np.shape(paid))}, expected {expected}: a count for each action")
         seen = _dream(
             self._agent,
             self._model.world_model,
@@ -325,6 +335,7 @@ class Dreamer:
             frames_BO,
             jnp.asarray(actions_BT.T),
             past if self.needs else None,
+            paid_BA,
             jax.random.key(seed),
         )
         arrays = [np.asarray(x).swapaxes(0, 1) for x in seen]
@@ -364,10 +375,11 @@ def _dream(
     frames_BO: jax.Array,
     action_TB: jax.Array,
     past: Past | None,
+    paid_BA: jax.Array | None,
     key: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     model = nnx.merge(agent.world_model_graph, world_model)
-    dream = agent.dream_from(model, tokenizer, frames_BO, None, len(action_TB), past)
+    dream = agent.dream_from(model, tokenizer, frames_BO, None, len(action_TB), past, None, paid_BA)
     start, _ = dream.reset(key)
 
     def step(state: Any, inputs: tuple[jax.Array, jax.Array]) -> tuple[Any, Any]:

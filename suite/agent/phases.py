@@ -182,7 +182,7 @@ class Agent:
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def remember(self, replay: ReplayState, trajectory: ppo.Trajectory) -> ReplayState:
         """Step 1, second line: the real steps enter the replay buffer."""
-        return self.replay.add(replay, trajectory, self.tokens.pays if self.told_of_pay else None)
+        return self.replay.add(replay, trajectory, self.spec.pays if self.told_of_pay else None)
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
     def learn(
@@ -253,7 +253,7 @@ class Agent:
         eventful = None
         if config.event_share:
             length = self.ages + config.sequence_length + 1
-            eventful = self.replay.eventful(replay, self.tokens.pays, length, skipped=self.ages)
+            eventful = self.replay.eventful(replay, self.spec.pays, length, skipped=self.ages)
 
         def update(model_state, key):
             sample_key, dropout_key = jax.random.split(key)

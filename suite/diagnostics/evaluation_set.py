@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from suite import registry
@@ -25,6 +26,7 @@ from suite.records.tables import write_whole
 from suite.runtime.cache import cache_dir
 from suite.runtime.compilation import enable_compilation_cache
 from suite.runtime.reporting import Reporter
+from suite.world_model.history import paid_before
 
 COLLECTOR = "mfrl"
 TRAJECTORIES, STEPS = 160, 20  # N_eval, T_eval
@@ -32,7 +34,7 @@ BEFORE = 15  # steps before those: some models are told of what happened earlier
 PAIRS = {"paper": 100_000, "small": 20_000, "smoke": 200}
 VALIDATION = 8  # every so many environments, one is kept for validation; one at least
 SYMBOLS = "symbols"
-VERSION = 2  # of what is kept and how it is drawn
+VERSION = 3  # of what is kept and how it is drawn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +47,7 @@ class EvaluationSet:
       reward: float32 [N, T].
       terminated, ended: bool [N, T]; an end by the rules; any end.
       symbols: int32 [N, T, R], of the frames that steps led to; R = 0 for a task without symbols.
+      paid: uint8 [N, T, A]; how often each action had earned a reward in the episode before the step.
     """
 
     frames: np.ndarray
@@ -53,6 +56,7 @@ class EvaluationSet:
     terminated: np.ndarray
     ended: np.ndarray
     symbols: np.ndarray
+    paid: np.ndarray
 
     @property
     def counted(self) -> np.ndarray:
@@ -181,13 +185,18 @@ def collect(agent: Agent, pairs: int, reporter: Reporter) -> tuple[EvaluationSet
     validation_B = np.arange(envs) >= envs - max(1, envs // VALIDATION)
     kept: list[dict[str, np.ndarray]] = []
     pairs_kept: list[dict[str, np.ndarray]] = []
+    paid_BA = jnp.zeros((envs, agent.spec.num_actions), jnp.uint8)
 
     def keep(iteration: int, phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Runs a phase of Algorithm 1; of real play it keeps what is wanted."""
+        nonlocal paid_BA
         result = function(*arguments)
         if phase == "collect":
             rollout_state, trajectory, log = result
             arrays = _arrays(jax.device_get((trajectory, rollout_state.time_step.observation, log)))
+            pays_TB = agent.spec.pays(trajectory.reward_TB)
+            paid_TBA, paid_BA = paid_before(paid_BA, trajectory.action_TB, pays_TB, trajectory.first_TB)
+            arrays["paid"] = np.asarray(paid_TBA)
             here = np.sort(drawn[drawn // envs == iteration] % envs)
             for env in here:
                 start = random.integers(length - steps + 1)

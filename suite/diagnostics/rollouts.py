@@ -86,7 +86,8 @@ def imagine(
         frames = real.frames[first : first + CHUNK, : seen + 1]
         action = real.action[first : first + CHUNK, :seen]
         missing = [(0, min(CHUNK, len(real.action)) - len(action))]  # one shape, one compilation
-        padded = [np.pad(x, missing + [(0, 0)] * (x.ndim - 1), mode="edge") for x in (frames, action)]
+        paid = real.paid[first : first + CHUNK, :seen]
+        padded = [np.pad(x, missing + [(0, 0)] * (x.ndim - 1), mode="edge") for x in (frames, action, paid)]
         batch_rollouts = _imagine(agent, world_model, tokenizer, *padded, jax.random.fold_in(key, first))
         *arrays, copied, tokens = (np.asarray(x)[: len(action)] for x in jax.device_get(batch_rollouts))
         copies.append(copied)
@@ -106,6 +107,7 @@ def _imagine(
     tokenizer: TokenizerState,
     frames_NTO: jax.Array,
     action_NT: jax.Array,
+    paid_NTA: jax.Array,
     key: jax.Array,
 ) -> tuple[jax.Array, ...]:
     """The fields of `Rollouts` in their order but for the last two: what is copied, and the real frames' tokens.
@@ -115,8 +117,11 @@ def _imagine(
     model = nnx.merge(agent.world_model_graph, world_model)
     context = agent.config.imagination.context
     past, horizon = agent.past, action_NT.shape[1] - agent.past
-    known = Past(jnp.swapaxes(frames_NTO[:, :past], 0, 1), action_NT[:, :past].T) if past else None
-    dream = agent.dream_from(model, tokenizer, frames_NTO[:, past], None, horizon, known)
+    known = None
+    if past:
+        frames, action, paid = (jnp.swapaxes(x[:, :past], 0, 1) for x in (frames_NTO, action_NT, paid_NTA))
+        known = Past(frames, action, paid_PBA=paid)
+    dream = agent.dream_from(model, tokenizer, frames_NTO[:, past], None, horizon, known, None, paid_NTA[:, past])
     start, _ = dream.reset(key)
 
     def step(state: Any, inputs: Any) -> Any:
@@ -127,7 +132,9 @@ def _imagine(
     _, imagined = jax.lax.scan(step, start, (jax.random.split(key, horizon), action_NT[:, past:].T))
     tokens_NTL = agent.tokenizer.encode(tokenizer, frames_NTO)
     read = slice(past - context, -1)
-    history_NT = History(ages_of(tokens_NTL, agent.ages)[:, read] if agent.ages else None)
+    history_NT = History(
+        ages_of(tokens_NTL, agent.ages)[:, read] if agent.ages else None, paid_NTA[:, past - context :]
+    )
     hidden = _hidden_states(model, tokens_NTL[:, read], action_NT[:, past - context :], history_NT)[:, context:]
     tokens_NTL = tokens_NTL[:, past:]
     copied_NT = jnp.zeros(hidden.shape[:2])

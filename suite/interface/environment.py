@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, Literal, Protocol
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from suite.interface.turns import Turn
@@ -35,6 +36,13 @@ class ObservationSpec:
     high: int
     kind: Literal["pixels", "grid", "symbols"]
     patch: tuple[int, int] | None = None
+
+
+def nearest_level(levels: tuple[float, ...], reward: jax.Array) -> jax.Array:
+    """int32 index of the level nearest to each reward, ties to the higher level (fidelity note 22)."""
+    ascending = jnp.asarray(levels, jnp.float32)
+    boundaries = (ascending[1:] + ascending[:-1]) / 2
+    return jnp.searchsorted(boundaries, reward, side="right").astype(jnp.int32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +89,10 @@ class EnvironmentSpec:
     def max_return(self) -> float | None:
         """The sum of all achievements' rewards (22 for Craftax-classic); None where there are none."""
         return sum(self.achievement_rewards) if self.achievements else None
+
+    def pays(self, reward: jax.Array) -> jax.Array:
+        """bool: whether the level nearest to each reward is above 0."""
+        return jnp.asarray(self.reward_classes, jnp.float32)[nearest_level(self.reward_classes, reward)] > 0
 
 
 @struct.dataclass

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 
+from suite.interface.environment import nearest_level
 from suite.interface.turns import Turn
 
 TokenizerState = Any  # A tokenizer's own pytree of arrays: parameters, codebook, optimizer.
@@ -48,17 +49,11 @@ class TokenSpec:
 
     def reward_to_class(self, reward: jax.Array) -> jax.Array:
         """int32 index of the level nearest to each reward, ties to the higher level (fidelity note 22)."""
-        levels = jnp.asarray(self.reward_classes, jnp.float32)
-        boundaries = (levels[1:] + levels[:-1]) / 2
-        return jnp.searchsorted(boundaries, reward, side="right").astype(jnp.int32)
+        return nearest_level(self.reward_classes, reward)
 
     def class_to_reward(self, index: jax.Array) -> jax.Array:
         """float32 reward level of each class index."""
         return jnp.asarray(self.reward_classes, jnp.float32)[index]
-
-    def pays(self, reward: jax.Array) -> jax.Array:
-        """bool: whether the level nearest to each reward is above 0."""
-        return self.class_to_reward(self.reward_to_class(reward)) > 0
 
 
 class Tokenizer(Protocol):

@@ -93,6 +93,8 @@ MODEL_NOTES = {
     "world_model.place_heads": False,
     "world_model.ages": 0,
     "world_model.patch_contents": False,
+    "world_model.paid": 0,
+    "world_model.event_share": 0.0,
     "world_model.optimizer": "adam",  # 23
     "world_model.average": 0.0,
     "imagination.min_p": 0.0,
@@ -184,6 +186,8 @@ M6 = {
     "games": {},  # of two players alone
     "average": {"world_model.average": 0.99},
     "codes": {"tokenizer.threshold": 0.5, "tokenizer.codebook_size": 8192},
+    "events": {"world_model.event_share": 0.3},
+    "paid": {"world_model.paid": 8},
     "trust": {"imagination.trust": 0.5, "imagination.trust_window": 10},
 }
 

@@ -187,12 +187,16 @@ def test_a_model_that_knows_what_came_before(tmp_path):
     run = restore(RunRecord.open(folders[1], lock=False), QUIET)
     model, tokenizer = run.model.world_model, run.model.tokenizer
     real, past = evaluation_set.load("unknown", "smoke", QUIET), run.agent.past
+    paid = np.random.default_rng(0).integers(0, 9, real.paid.shape, np.uint8)  # the corridor pays at its end alone
+    real = dataclasses.replace(real, paid=paid)
     found = rollouts.imagine(run.agent, model, tokenizer, real, jax.random.key(0), start=past)
     tokens_NTL = run.agent.tokenizer.encode(tokenizer, real.frames)
     whole = nnx.merge(run.agent.world_model_graph, model)
     age_NTL = ages_of(tokens_NTL, run.agent.ages)
     shown = slice(past, past + found.steps)
-    hidden = whole(tokens_NTL[:, shown], real.action[:, shown], history_BT=History(age_NTL[:, shown]))
+    assert run.agent.told_of_pay
+    history = History(age_NTL[:, shown], jnp.asarray(real.paid[:, shown]))
+    hidden = whole(tokens_NTL[:, shown], real.action[:, shown], history_BT=history)
     np.testing.assert_allclose(found.reward_odds, jax.nn.softmax(whole.reward_logits(hidden)), rtol=1e-4, atol=1e-6)
     np.testing.assert_array_equal(
         found.tokenized, run.agent.tokenizer.decode(tokenizer, tokens_NTL[:, past : past + found.steps + 1])

@@ -47,6 +47,7 @@ def real():
         terminated=ENDED,
         ended=ENDED,
         symbols=read(frames[:, 1:]),
+        paid=np.zeros((3, 3, 2), np.uint8),
     )
 
 

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import nnx
-from suite.world_model.ages import History, ages_of, next_ages
 
 from suite import registry
 from suite.runtime.errors import UserError
 from suite.world_model import training
+from suite.world_model.history import History, ages_of, next_ages
 from suite.world_model.sequences import Sequences
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import GRID, SPEC, small_config, small_model
