@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,14 +104,6 @@ def ranges(numbers: Iterable[int]) -> str:
 def as_csv(board: pd.DataFrame) -> bytes:
     """Numbers with eight digits: what differs between machines' ways of adding up is far below."""
     return board.map(_cell).astype(str).to_csv(index=False, lineterminator="\n").encode()
-
-
-def tables_digest(files: Mapping[str, bytes]) -> str:
-    """SHA-256 of all leaderboards, by which a page says what it was made from."""
-    digest = hashlib.sha256()
-    for name in sorted(files):
-        digest.update(f"{name} {len(files[name])}\n".encode() + files[name])
-    return digest.hexdigest()
 
 
 def _cell(value: Any) -> str:

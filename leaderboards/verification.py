@@ -1,4 +1,4 @@
-"""`suite verify`: whether every row of ours follows from its evidence."""
+"""`suite verify`: whether every row of ours follows from its evidence, and the page from the rows."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import csv
 import io
 from pathlib import Path
 
-from leaderboards.boards import as_csv, boards, tables_digest
+from leaderboards.boards import as_csv, boards
 from leaderboards.publish import PAGE, evidence_in
+from leaderboards.published import PATH
+from leaderboards.qualification import EVIDENCE
+from leaderboards.results import run_folders
 from suite.runtime.errors import UserError
 
 
@@ -21,14 +24,32 @@ def verify(out: Path) -> list[str]:
     if not standings and not refusals:
         raise UserError(f"no run in {out / 'evidence'}: nothing to verify {out} with")
     problems = [f"evidence does not qualify: {refusal}" for refusal in refusals]
-    tables = {name: as_csv(board) for name, board in boards(standings).items()}
-    for name, content in tables.items():
-        problems += (f"{name}: {problem}" for problem in _differences(out / name, content))
-    page = out / PAGE
-    if page.exists() and f'content="{tables_digest(tables)}"' not in page.read_text(errors="replace"):
-        problems.append(f"{PAGE}: made from other tables: publish again with --page {out}")
-    others = {path.name for path in out.glob("*.csv")} - tables.keys() - {"published.csv"}
-    return [*problems, *(f"{name}: made from no evidence" for name in sorted(others))]
+    tables = boards(standings)
+    for name, board in tables.items():
+        problems += (f"{name}: {problem}" for problem in _differences(out / name, as_csv(board)))
+    if (out / PAGE).exists():
+        from leaderboards.page.page import page
+
+        if (out / PAGE).read_bytes() != page([standing.entry for standing in standings], tables):
+            problems.append(f"{PAGE}: not what these runs give: publish again with --page {out}")
+    literature = out / PATH.name
+    if literature.exists() and literature.read_bytes() != PATH.read_bytes():
+        problems.append(f"{PATH.name}: not this version's")
+    others = {path.name for path in out.glob("*.csv")} - tables.keys() - {PATH.name}
+    problems += (f"{name}: made from no evidence" for name in sorted(others))
+    return problems + [f"{path.relative_to(out)}: belongs to no run" for path in _foreign(out / "evidence")]
+
+
+def _foreign(evidence: Path) -> list[Path]:
+    """Files that are neither evidence of a run nor, below a folder of that name, tables of `suite inspect`."""
+    runs = set(run_folders([evidence]))
+    return [
+        path
+        for path in sorted(evidence.rglob("*"))
+        if path.is_file()
+        and not (path.parent in runs and path.name in EVIDENCE)
+        and not ("inspect" in path.parts and path.suffix == ".csv")
+    ]
 
 
 def _differences(path: Path, expected: bytes) -> list[str]:

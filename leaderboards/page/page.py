@@ -13,7 +13,7 @@ import jinja2
 import markupsafe
 import pandas as pd
 
-from leaderboards.boards import IMPROVEMENT, OVERALL, as_csv, sees, tables_digest
+from leaderboards.boards import IMPROVEMENT, OVERALL, sees
 from leaderboards.families import families
 from leaderboards.page import plots
 from leaderboards.publish import PAGE
@@ -76,14 +76,24 @@ def write_page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame], fol
     """Writes `folder/index.html`, which holds everything that it shows.
 
     Args:
-      entries: for the figures.
-      tables: what `leaderboards.boards` makes of them.
+      entries, tables: as for `page`.
       folder: is made if it is not there.
 
     Raises:
       UserError: the folder cannot be written.
     """
     require_writable(folder)
+    write_whole(folder / PAGE, page(entries, tables))
+    return folder / PAGE
+
+
+def page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame]) -> bytes:
+    """The page, always the same bytes for the same runs.
+
+    Args:
+      entries: for the figures.
+      tables: what `leaderboards.boards` makes of them.
+    """
     everything = pd.concat([table for table in tables.values() if len(table)], ignore_index=True)
     sections = [_section(name, table, entries, everything) for name, table in tables.items() if len(table)]
     budgets = sorted({int(steps) for table in tables.values() for steps in table["steps"].dropna()})
@@ -93,7 +103,6 @@ def write_page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame], fol
     html = environment.get_template("page.html.jinja").render(
         css=markupsafe.Markup((HERE / "page.css").read_text()),
         script=markupsafe.Markup((HERE / "page.js").read_text()),
-        digest=tables_digest({name: as_csv(table) for name, table in tables.items()}),
         sections=sections,
         runs=sum(len(entry.records) for entry in entries),
         filters=[
@@ -102,8 +111,7 @@ def write_page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame], fol
             {"name": "origin", "label": "From", "options": [("ours", "measured here"), ("theirs", "published")]},
         ],
     )
-    write_whole(folder / PAGE, _classes_for_styles(html).encode())
-    return folder / PAGE
+    return _classes_for_styles(html).encode()
 
 
 def _classes_for_styles(html: str) -> str:

@@ -358,6 +358,14 @@ def test_tampering_is_found(suite, name, old, new, found):
     assert (code, err) == (1, "") and found in out
 
 
+def test_a_changed_page_is_found(suite):
+    write()
+    suite("publish", "--page", "leaderboards")
+    assert suite("verify", "leaderboards")[0] == 0
+    edit(Path("leaderboards/index.html"), "breakout", "breakour")
+    assert suite("verify", "leaderboards")[1].startswith("index.html: not what these runs give: publish again with")
+
+
 def test_missing_and_foreign_files_are_found(suite):
     code, out, err = suite("verify", "leaderboards")
     assert code == 2 and err.startswith("error: no run in leaderboards/evidence: nothing to verify")
@@ -365,7 +373,9 @@ def test_missing_and_foreign_files_are_found(suite):
     write("m5")
     suite("publish", "--page", "leaderboards")
     assert suite("verify", "leaderboards")[0] == 0
-    edit(Path("leaderboards/index.html"), 'name="tables-sha256" content="', 'name="tables-sha256" content="0')
+    Path("leaderboards/published.csv").write_text("changed")
+    Path("leaderboards/evidence/notes.txt").write_text("")
+    (Path("leaderboards") / SEED_0 / "extra.csv").write_text("")
     Path("leaderboards/minatar_pong.csv").write_text("rank\n1\n")
     Path("leaderboards/overall.csv").unlink()
     shutil.rmtree("leaderboards/evidence/minatar/breakout/m5")
@@ -375,7 +385,10 @@ def test_missing_and_foreign_files_are_found(suite):
         "overall.csv: cannot be read (No such file or directory)",
         "minatar_breakout.csv: 6 rows, the evidence gives 5",
         "minatar_pong.csv: made from no evidence",
-        "index.html: made from other tables: publish again with --page leaderboards",
+        "index.html: not what these runs give: publish again with --page leaderboards",
+        "published.csv: not this version's",
+        "evidence/notes.txt: belongs to no run",
+        f"{SEED_0}/extra.csv: belongs to no run",
     ):
         assert line in out.splitlines()
 
