@@ -64,6 +64,7 @@ def spec(name: str) -> EnvironmentSpec:
         num_actions=len(game.actions),
         reward_classes=game.rewards,
         package="gymnax",
+        action_names=game.actions,
         ranges=(("length", 1, game.longest),),
         step_rewards=(game.rewards[0], game.rewards[-1]),
     )

@@ -14,14 +14,17 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import NoReturn
 
 from suite.runtime.compilation import quiet_xla, refuse_other_arithmetic
 from suite.runtime.errors import RunError, UserError, did_you_mean, host_errors
 
-COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "compare", "sweep", "publish", "verify", "bench")
+COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "watch", "compare", "sweep", "publish", "verify", "bench")
 STOPPED = 130
+COMPLETION = "--print-completion"
+SHELLS = ("bash", "zsh", "tcsh")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,6 +55,9 @@ def _dispatch(argv: list[str]) -> int:
     if argv == ["--version"]:
         print(f"suite {importlib.metadata.version('world-model-suite')}")
         return 0
+    if argv[:1] == [COMPLETION]:
+        print(completion(*argv[1:]))
+        return 0
     args = parse(argv)
     return importlib.import_module(f"suite.commands.{args.command}").execute(args)
 
@@ -78,11 +84,39 @@ def parse(argv: list[str]) -> argparse.Namespace:
     return args
 
 
+def completion(shell: str = "", *rest: str) -> str:
+    """What a shell must read so that it completes commands, options, and ids of tasks, agents and presets.
+
+    Raises:
+      UserError: no shell, or none that is known.
+    """
+    if shell not in SHELLS or rest:
+        raise UserError(f"{COMPLETION} takes one of {', '.join(SHELLS)}")
+    import shtab
+
+    from suite import registry
+
+    ids: dict[str, list[str]] = {
+        "task": [*registry.tasks()],
+        "agent": [*registry.agents()],
+        "preset": [*registry.presets()],
+    }
+    parser, parsers = _parsers({name: importlib.import_module(f"suite.commands.{name}") for name in COMMANDS})
+    for command in parsers.values():
+        for action in command._actions:
+            if action.dest in ids:
+                action.choices = ids[action.dest]
+            elif action.type is Path:
+                vars(action)["complete"] = shtab.FILE
+    return str(shtab.complete(parser, shell=shell))
+
+
 def _parsers(modules: dict[str, ModuleType]) -> tuple[_Parser, dict[str, _Parser]]:
     parser = _Parser(
         prog="suite", description="Sample-efficient reinforcement learning with a transformer world model."
     )
     parser.add_argument("--version", action="store_true", help="print the version, and nothing else")
+    parser.add_argument(COMPLETION, metavar="SHELL", help=f"print what {', '.join(SHELLS)} read to complete words")
     sub = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     parsers: dict[str, _Parser] = {}
     for name, module in modules.items():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import subprocess
 import sys
 
@@ -10,9 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 
 import suite
 from suite import registry
+from suite.diagnostics.watching import Episode, captions
+from suite.records.record import RunRecord, run_folder
 from suite.runs.training import Iteration
 from suite.runtime.errors import UserError
 from tests.documents import code
@@ -159,3 +164,42 @@ def test_the_example_in_the_documents_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     exec(code("docs/python.md", "python", "import suite"), {})
     assert "% of the cells are right" in capsys.readouterr().out
+
+
+def test_a_film_of_a_run(trained, suite, tmp_path):
+    """`suite watch`: two episodes, and beside each frame what was expected of it."""
+    run, _ = trained
+    path = tmp_path / "film.gif"
+    words = ("watch", run.folder, "--dream", "--episodes", "2", "--steps", "7", "--out", path, "--quiet", "--json")
+    code, out, err = suite(*words)
+    shown = json.loads(out.splitlines()[-1])
+    assert (code, err) == (0, "") and out.splitlines()[0].startswith(f"episode 1: {shown['lengths'][0]} steps, return ")
+    with Image.open(path) as image:
+        assert shown["film"] == str(path) and 2 <= image.n_frames <= sum(shown["lengths"]) <= 14
+    code, out, err = suite("watch", run.folder, "--episodes", "100")
+    assert (code, out) == (2, "") and "environments play side by side" in err
+
+
+def test_what_stands_above_a_frame():
+    spec = dataclasses.replace(WIDE_CORRIDOR.spec(), action_names=("back", "on"))
+    none = np.zeros((3, 4, 4, 1), np.uint8)
+    unlocked = np.array([[False], [True], [True]])
+    episode = Episode(none, np.array([0, 1, 1]), np.array([0.0, 1.0, -0.2]), np.array([0.5, 0.25, 0]), unlocked, True)
+    assert captions(episode, spec, 2) == [
+        "episode 2, step 1: back\nreturn 0.0, value 0.50",
+        "episode 2, step 2: on +1.0 arrive!\nreturn 1.0, value 0.25",
+        "episode 2, step 3: on -0.2\nreturn 0.8, value 0.00",
+    ]
+
+
+def test_what_cannot_be_filmed(suite, tmp_path):
+    for task, agent, words, message in (
+        ("openspiel/leduc", "mfrl", (), "shows symbols and no frames to film"),
+        (TASK, "mfrl", ("--dream",), "has no world model to dream with: mfrl"),
+        (TASK, "m5", ("--steps", "1"), "--steps=1: must be at least 2"),
+    ):
+        config = registry.resolve(task, agent, "smoke")
+        with RunRecord.create(run_folder(tmp_path, config), config, registry.task(task).spec()) as record:
+            folder = record.folder
+        code, out, err = suite("watch", folder, *words)
+        assert (code, out) == (2, "") and message in err and err.count("\n") == 1

@@ -55,6 +55,19 @@ FURTHER_ACHIEVEMENTS = (
 )
 
 
+# In the order of their numbers; the classic game has those of the first tuple.
+CLASSIC_ACTIONS = (
+    *("noop", "left", "right", "up", "down", "do", "sleep", "place_stone", "place_table", "place_furnace"),
+    *("place_plant", "make_wood_pickaxe", "make_stone_pickaxe", "make_iron_pickaxe"),
+    *("make_wood_sword", "make_stone_sword", "make_iron_sword"),
+)
+FURTHER_ACTIONS = (
+    *("rest", "descend", "ascend", "make_diamond_pickaxe", "make_diamond_sword", "make_iron_armour"),
+    *("make_diamond_armour", "shoot_arrow", "make_arrow", "cast_fireball", "cast_iceball", "place_torch"),
+    *(f"drink_potion_{color}" for color in ("red", "green", "blue", "pink", "cyan", "yellow")),
+    *("read_book", "enchant_sword", "enchant_armour", "make_torch"),
+    *("level_up_dexterity", "level_up_strength", "level_up_intelligence", "enchant_bow"),
+)
 START_HEALTH = 9
 HEALTH_REWARD = 0.1  # per point of health gained or lost
 
@@ -63,7 +76,7 @@ def _spec(
     id: str,
     pixels: tuple[int, int, int],
     tile: int,
-    actions: int,
+    actions: tuple[str, ...],
     rewards: dict[str, float],
     longest: int,
     most_health: int,
@@ -72,7 +85,8 @@ def _spec(
     return EnvironmentSpec(
         id=id,
         observation=ObservationSpec(shape=pixels, high=255, kind="pixels", patch=(tile, tile)),
-        num_actions=actions,
+        num_actions=len(actions),
+        action_names=actions,
         reward_classes=(0.0, *sorted(set(rewards.values()))),
         achievements=tuple(rewards),
         achievement_rewards=tuple(rewards.values()),
@@ -88,12 +102,14 @@ def _spec(
 
 
 _CLASSIC = dict.fromkeys(CLASSIC_ACHIEVEMENTS, 1.0)
-CLASSIC_SPEC = _spec("craftax_classic", (63, 63, 3), 7, 17, _CLASSIC, longest=10_000, most_health=START_HEALTH)
+CLASSIC_SPEC = _spec(
+    "craftax_classic", (63, 63, 3), 7, CLASSIC_ACTIONS, _CLASSIC, longest=10_000, most_health=START_HEALTH
+)
 FULL_SPEC = _spec(
     "craftax_full",
     (130, 110, 3),
     10,
-    43,
+    CLASSIC_ACTIONS + FURTHER_ACTIONS,
     _CLASSIC | {name: reward for reward, names in FURTHER_ACHIEVEMENTS for name in names},
     longest=100_000,
     most_health=13,  # of the strongest player

@@ -90,24 +90,25 @@ def filmstrip(strip: Strip) -> Image.Image:
     return picture
 
 
-def film(path: Path, strip: Strip) -> None:
-    """The same as an animated GIF: real and imagined frames side by side."""
+def film(path: Path, strip: Strip, seconds: float = SECONDS) -> None:
+    """The same as an animated GIF: real and imagined frames side by side, each for so many seconds."""
     frames = _drawn(strip)
     height, width = frames["real"][0].shape[:2]
-    pages = []
+    pages, lines = [], max(note.count("\n") + 1 for note in strip.notes)
     for t in range(len(strip.real)):
-        page = Image.new("RGB", (max(GAP + len(frames) * (width + GAP), 420), 2 * HEADER + height + GAP), PAPER)
+        top = HEADER * (1 + lines)
+        page = Image.new("RGB", (max(GAP + len(frames) * (width + GAP), 420), top + height + GAP), PAPER)
         draw = ImageDraw.Draw(page)
         draw.text((GAP, 3), strip.notes[t], INK, font(14))
         for i, (label, images) in enumerate(frames.items()):
             x = GAP + i * (width + GAP)
-            draw.text((x, HEADER), label if t < len(images) else f"{label}: ended", INK, font(14))
+            draw.text((x, top - HEADER), label if t < len(images) else f"{label}: ended", INK, font(14))
             if t < len(images):
-                page.paste(Image.fromarray(images[t]), (x, 2 * HEADER))
+                page.paste(Image.fromarray(images[t]), (x, top))
         pages.append(page)
     content = io.BytesIO()
     pages[0].save(
-        content, "GIF", save_all=True, append_images=pages[1:], duration=round(1000 * SECONDS), loop=0, optimize=False
+        content, "GIF", save_all=True, append_images=pages[1:], duration=round(1000 * seconds), loop=0, optimize=False
     )
     write_whole(path, content.getvalue())
 

@@ -63,6 +63,7 @@ class EnvironmentSpec:
       chance_outcomes: C, how many outcomes chance has in a two-player game; 0: there is no chance.
       fully_observed: whether what is seen is all there is to know, as on a board; False: not, or it is not known.
       light_changes: whether the same thing is drawn in more than one light, as by day and by night.
+      action_names: of the A actions, if they have names.
       ranges: what the rules allow of whole episodes: a column of `episodes.csv`, the least and the most. Of other
         columns nothing is known.
       step_rewards: the least and the most that one step can pay; None: that is not known.
@@ -81,6 +82,7 @@ class EnvironmentSpec:
     chance_outcomes: int = 0
     fully_observed: bool = False
     light_changes: bool = False
+    action_names: tuple[str, ...] = ()
     ranges: tuple[tuple[str, float, float], ...] = ()
     step_rewards: tuple[float, float] | None = None
     return_parts: tuple[str, ...] = ()

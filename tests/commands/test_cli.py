@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -362,3 +363,17 @@ def test_a_kind_of_device_that_is_not_there(asked):
     words = [sys.executable, "-m", "suite", "run", *SMOKE]
     ran = subprocess.run(words, env=os.environ | {"JAX_PLATFORMS": asked}, capture_output=True, text=True, check=False)
     refused((ran.returncode, ran.stdout, ran.stderr), f"no device for JAX_PLATFORMS='{asked}'", "JAX_PLATFORMS=cpu")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_completion_in_a_shell(suite):
+    code, script, err = suite("--print-completion", "bash")
+    assert (code, err) == (0, "")
+    ask = 'COMP_WORDS=({}); COMP_CWORD={}; _shtab_suite; echo "${{COMPREPLY[@]}}"\n'
+    asked = [("suite ver", "verify"), ("suite run openspiel/l", "openspiel/leduc"), ("suite run x --ag", "--agent")]
+    script += "".join(ask.format(words, len(words.split()) - 1) for words, _ in asked)
+    found = subprocess.run(["bash"], input=script, capture_output=True, text=True, check=True).stdout
+    assert found.splitlines() == [expected for _, expected in asked]
+    for words in ((), ("fish",), ("bash", "zsh")):
+        code, out, err = suite("--print-completion", *words)
+        assert (code, out, err) == (2, "", "error: --print-completion takes one of bash, zsh, tcsh\n")

@@ -19,6 +19,7 @@ def test_achievements_are_those_of_the_game_in_its_order():
     assert len(CLASSIC_SPEC.achievements) == CLASSIC_SPEC.max_return == 22
     assert set(CLASSIC_SPEC.achievement_rewards) == {1.0}
     assert CLASSIC_SPEC.num_actions == len(Action) == 17
+    assert CLASSIC_SPEC.action_names == tuple(a.name.lower() for a in Action)
 
 
 def test_death_terminates_and_the_limit_truncates(play):

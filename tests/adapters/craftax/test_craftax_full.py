@@ -45,6 +45,7 @@ def test_achievements_are_those_of_the_game_in_its_order_and_pay_what_they_pay()
     assert FULL_SPEC.achievements == tuple(a.name.lower() for a in sorted(Achievement, key=lambda a: a.value))
     assert FULL_SPEC.achievement_rewards == tuple(map(float, ACHIEVEMENT_REWARD_MAP))
     assert FULL_SPEC.num_actions == len(Action) == 43
+    assert FULL_SPEC.action_names == tuple(a.name.lower() for a in Action)
 
 
 def test_the_numbers_of_the_paper():
