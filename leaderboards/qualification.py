@@ -180,10 +180,7 @@ def _time_reasons(episodes: pd.DataFrame, config: Config, spec: EnvironmentSpec)
 
 def impossible(episodes: pd.DataFrame, spec: EnvironmentSpec) -> Iterator[str]:
     """What the rules of the game do not allow."""
-    ranges = spec.ranges
-    if spec.two_player:  # pays once, at the end
-        ranges += (("return", spec.reward_classes[0], spec.reward_classes[-1]),)
-    limits: dict[str, tuple[Any, Any]] = {name: (low, high) for name, low, high in ranges}
+    limits: dict[str, tuple[Any, Any]] = {name: (low, high) for name, low, high in spec.ranges}
     if spec.step_rewards is not None:
         least, most = spec.step_rewards
         limits["return"] = (least * episodes["length"], most * episodes["length"])

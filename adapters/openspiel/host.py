@@ -106,7 +106,8 @@ def measured(game: Any, spec: EnvironmentSpec) -> EnvironmentSpec:
     if all(value.is_integer() for value in returns) and max(returns) - min(returns) < MAX_REWARD_CLASSES:
         rewards = tuple(float(level) for level in range(int(min(returns)), int(max(returns)) + 1))
     observation = dataclasses.replace(spec.observation, high=min(2 * high, MAX_SYMBOL) if high > 1 else 1)
-    return dataclasses.replace(spec, observation=observation, reward_classes=rewards)
+    ranges = (*(row for row in spec.ranges if row[0] != "return"), ("return", rewards[0], rewards[-1]))
+    return dataclasses.replace(spec, observation=observation, reward_classes=rewards, ranges=ranges)
 
 
 def make(game: Any, spec: EnvironmentSpec) -> HostEnvironment:

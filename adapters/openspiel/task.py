@@ -61,7 +61,12 @@ def _specification(
         two_player=True,
         chance_outcomes=outcomes,
         fully_observed=fully_observed,
-        ranges=(("length", 1, longest), ("raw_return", *utility), ("seat", 1, 2)),
+        ranges=(
+            ("length", 1, longest),
+            ("raw_return", *utility),
+            ("seat", 1, 2),
+            ("return", rewards[0], rewards[-1]),  # paid once, at the end
+        ),
     )
 
 

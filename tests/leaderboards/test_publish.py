@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import shutil
@@ -398,3 +399,9 @@ def test_the_committed_leaderboards_follow_from_their_evidence(suite):
     folder = Path(__file__).parents[2] / "leaderboards"
     code, out, _ = suite("verify", folder)
     assert code == 0, out
+
+
+def test_a_foreign_game_may_pay_more_than_once():
+    """What its rules allow is not known."""
+    spec = dataclasses.replace(task("openspiel/leduc").spec(), ranges=())
+    assert not [*impossible(pd.DataFrame([{"return": 3.0, "length": 50}]), spec)]

@@ -39,7 +39,11 @@ def test_the_specification_is_the_engines(name):
     measured = openspiel.measured(name, tables)
     if name == "leduc":  # learned from the sign of -13..13
         assert (measured.reward_classes[0], measured.reward_classes[-1]) == (-13, 13)
-        measured = dataclasses.replace(measured, reward_classes=(-1.0, 0.0, 1.0))
+        *others, paid = measured.ranges
+        assert paid == ("return", -13, 13)
+        measured = dataclasses.replace(
+            measured, reward_classes=(-1.0, 0.0, 1.0), ranges=(*others, ("return", -1.0, 1.0))
+        )
     assert spec == measured
     if name in openspiel.GAMES:
         assert openspiel.spec(name) is openspiel.spec(openspiel.GAMES[name]) is spec
