@@ -1,4 +1,4 @@
-"""The agent (`Agent`): its parts, and each phase of an iteration of Algorithm 1 as a compiled function.
+"""The agent (`Agent`): each phase of an iteration of Algorithm 1 as a compiled function.
 
 Each phase is one compiled function over donated state, with its loop inside; only metrics return to the host. The
 state is one pytree of arrays, so that several seeds can become its leading axis. `suite.agent.algorithm` runs
@@ -17,59 +17,23 @@ import jax.numpy as jnp
 from flax import nnx
 
 from suite.agent import rollout as play
-from suite.agent.replay import Eventful, Experience, Replay, ReplayState
+from suite.agent.dreams import Dreaming
+from suite.agent.replay import Eventful, ReplayState
 from suite.agent.state import TrainState
-from suite.configuration.schema import Config
-from suite.interface.batching import Batched
-from suite.interface.environment import BatchedEnvironment, Environment, State
-from suite.interface.host import HostEnvironment
 from suite.interface.tokens import TokenizerState, encode_frame
-from suite.interface.turns import Turn, stream_action
+from suite.interface.turns import stream_action
 from suite.policy import ppo
-from suite.policy.actor_critic import make_policy
-from suite.runtime.errors import UserError
-from suite.tokenizers.nearest_neighbor import NearestNeighborState, NearestNeighborTokenizer
-from suite.tokenizers.stream import build_tokenizer
+from suite.tokenizers.nearest_neighbor import NearestNeighborState
 from suite.world_model import training as world_model_training
 from suite.world_model.history import History, ages_of
-from suite.world_model.imagination import Dream, Past
 from suite.world_model.sequences import Sequences
-from suite.world_model.transformer import WorldModel
 
 Metrics = dict[str, jax.Array]
 IMAGINATION_METRICS = (*ppo.METRICS, "reward_per_step", "termination_rate")
 
 
-class Agent:
-    """One agent on one task: the static parts (networks' structure, optimizers), and the compiled phases."""
-
-    def __init__(self, config: Config, environment: Environment):
-        """Builds the structure only; `init` makes the arrays.
-
-        Args:
-          config: the resolved configuration.
-          environment: one pure environment.
-
-        Raises:
-          UserError: it is to be dreamt in, but steps on the host, and so cannot go back to an earlier state.
-        """
-        if config.imagination.world == "game" and isinstance(environment, HostEnvironment):
-            raise UserError(
-                f"agent {config.agent} dreams in the game itself, and {config.task} steps on the host, where no dream "
-                "can start from an earlier state; it needs craftax_classic, craftax_full, minatar/* or a game of "
-                "openspiel/* that fits into tables"
-            )
-        self.config = config
-        self.spec = spec = environment.spec
-        self.batched = Batched(environment, config.environment.num_envs)
-        self.policy_graph = nnx.graphdef(nnx.eval_shape(lambda: self._new_policy(nnx.Rngs(0))))
-        self.policy_optimizer = ppo.make_optimizer(config.ppo)
-        if config.dreams:
-            self.replay = Replay.of(config)
-        if config.world_model.enabled:
-            self.tokenizer, self.tokens, self.grid = build_tokenizer(config, spec)
-            self.world_model_optimizer = world_model_training.make_optimizer(config.world_model)
-            self.world_model_graph = nnx.graphdef(nnx.eval_shape(lambda: self._new_world_model(nnx.Rngs(0))))
+class Agent(Dreaming):
+    """One agent on one task: its parts, how it dreams, and the compiled phases."""
 
     @property
     def metric_names(self) -> list[str]:
@@ -85,35 +49,6 @@ class Agent:
         if self.config.dreams:
             phases["imagine"] = IMAGINATION_METRICS
         return [f"{phase}/{metric}" for phase, metrics in phases.items() for metric in metrics]
-
-    @property
-    def learns_from_real(self) -> bool:
-        """Whether real play teaches its policy."""
-        return self.config.ppo.learn_from_real and self.config.policy.kind != "uniform"
-
-    @property
-    def ages(self) -> int:
-        """The highest age of a token that the world model is told; 0: it is told none."""
-        return self.config.world_model.ages if self.config.world_model.enabled and self.tokens.spatial else 0
-
-    @property
-    def told_of_pay(self) -> bool:
-        """Whether the world model is told how often each action has earned a reward."""
-        return bool(self.config.world_model.enabled and self.config.world_model.paid and self.tokens.spatial)
-
-    @property
-    def past(self) -> int:
-        """How many real frames before a dream's first one its world model is told of."""
-        return max(self.config.imagination.context, self.ages)
-
-    def _new_policy(self, rngs: nnx.Rngs) -> Any:
-        return make_policy(self.config.policy, self.spec.observation, self.spec.num_actions, rngs)
-
-    def _new_world_model(self, rngs: nnx.Rngs) -> WorldModel:
-        return WorldModel(self.config.world_model, self.tokens, self.grid, rngs)
-
-    def _policy(self, policy_state: ppo.PolicyTrainState) -> Any:
-        return nnx.merge(self.policy_graph, policy_state.params)
 
     def init(self, key: jax.Array) -> TrainState:
         """A fresh agent in fresh environments: two programs, since `start` is worth compiling only once."""
@@ -137,32 +72,6 @@ class Agent:
         if self.config.imagination.trust_window:
             model_state = dataclasses.replace(model_state, measured=jnp.zeros(1 + len(self.tokens.reward_classes)))
         return fresh | {"tokenizer": self.tokenizer.init(tokenizer_key), "world_model": model_state}
-
-    def new_replay(self) -> ReplayState:
-        """An empty replay buffer, with room for the environments' states if dreams happen in the game."""
-        lasting = self.lasting_tokenizer
-        return self.replay.init(
-            self.spec, self.kept_state, lasting.tokens_per_frame if lasting else 0, self.told_of_pay
-        )
-
-    @property
-    def lasting_tokenizer(self) -> NearestNeighborTokenizer | None:
-        """The tokenizer, if the tokens of stored frames are kept; else None.
-
-        They are if its codes never change and a frame is one observation. A frame is sampled many times, and looking
-        its codes up each time takes a fifth of an iteration on Craftax.
-        """
-        if not self.config.world_model.enabled or self.spec.two_player:
-            return None
-        return self.tokenizer if isinstance(self.tokenizer, NearestNeighborTokenizer) else None
-
-    @property
-    def kept_state(self) -> State:
-        """Shapes of one environment's state, if the replay buffer keeps states; else None."""
-        if self.config.imagination.world != "game":
-            return None
-        state_B, _ = jax.eval_shape(self.batched.reset, jax.random.key(0))
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state_B)
 
     @functools.partial(jax.jit, static_argnums=0)
     def start(self, policy_state: ppo.PolicyTrainState, key: jax.Array) -> play.RolloutState:
@@ -364,104 +273,3 @@ class Agent:
         zeros = dict.fromkeys(IMAGINATION_METRICS, jnp.zeros(()))
         policy_state, total = jax.lax.fori_loop(0, updates, update, (policy_state, zeros))
         return policy_state, jax.tree.map(lambda x: x / updates.astype(jnp.float32), total)
-
-    def dream(
-        self,
-        policy_state: ppo.PolicyTrainState,
-        model: WorldModel | None,
-        tokenizer: TokenizerState | None,
-        replay: ReplayState,
-        key: jax.Array,
-    ) -> ppo.Trajectory:
-        """One imagined rollout from replayed frames, the memory refreshed on the M frames before each (note 12)."""
-        plan, policy, memory = self.config.imagination, self._policy(policy_state), self.config.environment.burn_in
-        sample_key, start_key, rollout_key = jax.random.split(key, 3)
-        before = max(memory, self.past)
-        past = self.replay.sample(replay, sample_key, plan.num_envs, before + 1, plan.recent)
-        past = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), past)
-        dream = self._dreamt_world(model, tokenizer, past)
-        rollout_state = play.start(policy, dream, start_key, 0)
-        rollout_state = dataclasses.replace(
-            rollout_state,
-            time_step=dataclasses.replace(rollout_state.time_step, first=past.first[-1]),
-            recent=play.Recent(
-                past.observation[before - memory : -1],
-                past.first[before - memory : -1],
-                rollout_state.hidden_BH,
-                None if past.turn is None else past.turn.ours[before - memory : -1],
-            ),
-        )
-        rollout_state = play.refresh(policy, rollout_state, carried=False)
-        _, trajectory, _ = play.rollout(rollout_key, policy, policy_state.targets, dream, rollout_state, plan.horizon)
-        return trajectory
-
-    def _dreamt_world(
-        self, model: WorldModel | None, tokenizer: TokenizerState | None, past: Experience
-    ) -> BatchedEnvironment:
-        """The world model, or the true game, at the last of the replayed steps `past` (time-major)."""
-        plan = self.config.imagination
-        start = jax.tree.map(lambda x: x[-1], past)
-        if model is None:
-            game = Batched(self.batched.environment, plan.num_envs)
-            return game.resumed(start.state, start.observation, start.first, start.turn)
-        before = jax.tree.map(lambda x: x[len(past.first) - 1 - self.past : -1], past)
-        past_PBL, start_BL = (None if x.coded is None else x.coded.tokens for x in (before, start))
-        known = Past(before.observation, before.action, before.turn, past_PBL, before.paid) if self.past else None
-        return self.dream_from(
-            model, tokenizer, start.observation, start.turn, plan.horizon, known, start_BL, start.paid
-        )
-
-    def dream_from(
-        self,
-        model: WorldModel,
-        tokenizer: TokenizerState,
-        observation_BO: jax.Array,
-        turn_B: Turn | None,
-        horizon: int,
-        past: Past | None = None,
-        tokens_BL: jax.Array | None = None,
-        paid_BA: jax.Array | None = None,
-    ) -> Dream:
-        """The world model as an environment that starts at these frames (Algorithm 4).
-
-        Args:
-          model, tokenizer: the world model with its parameters, and its tokenizer's state.
-          observation_BO: the frames.
-          turn_B: whose turn it is there, in a game of two players.
-          horizon: steps that it can take.
-          past: the `self.past` real frames before these, if there are some to be told of.
-          tokens_BL: the frames' tokens, if they are known.
-          paid_BA: how often each action had earned a reward there, for a model that is told; None: nothing was paid.
-        """
-        plan = self.config.imagination
-        return Dream(
-            model,
-            self.tokenizer,
-            tokenizer,
-            self.spec,
-            self.tokens,
-            horizon,
-            observation_BO,
-            turn_B,
-            past=past,
-            start_tokens_BL=tokens_BL,
-            start_paid_BA=paid_BA,
-            context=plan.context,
-            min_p=plan.min_p,
-        )
-
-    def learn_from_dream(
-        self, policy_state: ppo.PolicyTrainState, trajectory: ppo.Trajectory
-    ) -> tuple[ppo.PolicyTrainState, Metrics]:
-        """PPO on one imagined trajectory."""
-        plan = self.config.imagination
-        return ppo.update(
-            self.config.ppo,
-            self.policy_optimizer,
-            self.policy_graph,
-            policy_state,
-            trajectory,
-            epochs=plan.epochs,
-            minibatches=plan.minibatches,
-            entropy_coefficient=plan.entropy_coefficient,
-        )
