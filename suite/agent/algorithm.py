@@ -114,6 +114,6 @@ def iterate(
     # Step 4: the policy learns from dreams, which begin at replayed frames.
     if updates := imagined_updates(steps, known):
         dreamt = None if world_model is None else world_model.dreaming
-        count = jnp.asarray(updates, jnp.int32)
-        policy_state, _ = call("imagine", agent.imagine, policy_state, dreamt, tokenizer, replay, dream_key, count)
+        when = jnp.asarray(updates, jnp.int32), jnp.asarray(steps, jnp.float32)
+        policy_state, _ = call("imagine", agent.imagine, policy_state, dreamt, tokenizer, replay, dream_key, *when)
     return TrainState(policy_state, rollout_state, replay, tokenizer, world_model), steps

@@ -108,9 +108,12 @@ class Dreaming(Parts):
         )
 
     def learn_from_dream(
-        self, policy_state: ppo.PolicyTrainState, trajectory: ppo.Trajectory
+        self,
+        policy_state: ppo.PolicyTrainState,
+        trajectory: ppo.Trajectory,
+        remaining: tuple[jax.Array, jax.Array] | None = None,
     ) -> tuple[ppo.PolicyTrainState, dict[str, jax.Array]]:
-        """PPO on one imagined trajectory."""
+        """PPO on one imagined trajectory; `remaining` as `suite.policy.ppo.update` has it."""
         plan = self.config.imagination
         return ppo.update(
             self.config.ppo,
@@ -121,4 +124,5 @@ class Dreaming(Parts):
             epochs=plan.epochs,
             minibatches=plan.minibatches,
             entropy_coefficient=plan.entropy_coefficient,
+            remaining=remaining,
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from flax import nnx
 
 from suite.agent.replay import Replay, ReplayState
@@ -71,6 +72,13 @@ class Parts:
     def past(self) -> int:
         """How many real frames before a dream's first one its world model is told of."""
         return max(self.config.imagination.context, self.ages)
+
+    def learning_rates_left(self, before: jax.Array, after: jax.Array) -> tuple[jax.Array, jax.Array] | None:
+        """What is left of the policy's learning rate after so many real steps (float32 scalars); None: all, always."""
+        if not self.config.ppo.anneal_learning_rate:
+            return None
+        total = self.config.total_steps
+        return jnp.maximum(1 - before / total, 0.0), jnp.maximum(1 - after / total, 0.0)
 
     def _new_policy(self, rngs: nnx.Rngs) -> Any:
         return make_policy(self.config.policy, self.spec.observation, self.spec.num_actions, rngs)

@@ -99,7 +99,6 @@ class Agent(Dreaming):
     ) -> tuple[ppo.PolicyTrainState, Metrics]:
         """Step 2: PPO on the real steps. `steps`: float32 [2], taken before and after them."""
         config = self.config.ppo
-        left = jnp.maximum(1 - steps / self.config.total_steps, 0.0)
         return ppo.update(
             config,
             self.policy_optimizer,
@@ -109,7 +108,7 @@ class Agent(Dreaming):
             epochs=config.epochs,
             minibatches=config.minibatches,
             entropy_coefficient=config.entropy_coefficient,
-            remaining=(left[0], left[1]) if config.anneal_learning_rate else None,
+            remaining=self.learning_rates_left(steps[0], steps[1]),
         )
 
     @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
@@ -253,17 +252,20 @@ class Agent(Dreaming):
         replay: ReplayState,
         key: jax.Array,
         updates: jax.Array,
+        steps: jax.Array,
     ) -> tuple[ppo.PolicyTrainState, Metrics]:
         """Step 4: `updates` times (a traced number, so that annealing never recompiles), dream and learn from it.
 
+        After `steps` real steps (float32 scalar), of which the learning rate depends if it is annealed.
         An agent that dreams in the true game has neither `world_model` nor `tokenizer`.
         """
         model = None if world_model is None else nnx.merge(self.world_model_graph, world_model)
+        remaining = self.learning_rates_left(steps, steps)
 
         def update(i, carry):
             policy_state, total = carry
             trajectory = self.dream(policy_state, model, tokenizer, replay, jax.random.fold_in(key, i))
-            policy_state, metrics = self.learn_from_dream(policy_state, trajectory)
+            policy_state, metrics = self.learn_from_dream(policy_state, trajectory, remaining)
             metrics |= {
                 "reward_per_step": trajectory.reward_TB.mean(),
                 "termination_rate": trajectory.terminated_TB.mean(dtype=jnp.float32),

@@ -88,7 +88,7 @@ class PPOConfig:
     # What is averaged for their spread: each minibatch's deviation, or the mean square (Moon et al., note 36).
     target_spread: Literal["deviation", "mean_square"] = "deviation"
     learning_rate: PositiveFloat = 4.5e-4
-    anneal_learning_rate: bool = False  # linear to 0 over the budget: MFRL only (note 11)
+    anneal_learning_rate: bool = False  # linear to 0 over the budget, in dreams too; in the paper MFRL alone (note 11)
     adam_eps: PositiveFloat = 1e-5
     max_grad_norm: PositiveFloat = 0.5
     learn_from_real: bool = True  # Algorithm 1, step 2
