@@ -67,6 +67,23 @@ def test_a_dream_in_the_game_ends_when_the_game_does(agent, played):
     assert (dream.terminated_TB[0] | dream.truncated_TB[0]).all()
 
 
+def test_an_annealed_rate_falls_in_dreams_too(agent, played):
+    """After half of the budget a dream moves the policy half as far as at the beginning; at the end, not at all."""
+    config = dataclasses.replace(agent.config, ppo=dataclasses.replace(agent.config.ppo, anneal_learning_rate=True))
+    annealed, (state, _) = Agent(config, WideCorridor()), played
+
+    def moved(steps):
+        before = jax.tree.map(jnp.copy, state.policy)
+        one, taken = jnp.asarray(1, jnp.int32), jnp.asarray(steps, jnp.float32)
+        after, _ = annealed.imagine(before, None, None, state.replay, jax.random.key(3), one, taken)
+        changes = jax.tree.map(lambda new, old: new - old, after.params, state.policy.params)
+        return np.concatenate([np.ravel(change) for change in jax.tree.leaves(changes)])
+
+    whole, half, none = (moved(share * config.total_steps) for share in (0, 0.5, 1))
+    assert np.abs(whole).max() > 1e-5 and not none.any()
+    np.testing.assert_allclose(half, whole / 2, atol=1e-6)
+
+
 def test_recent_steps_only(agent, played):
     """Sequences end in the latest steps of each environment, and are the buffer's, also after it has wrapped around."""
     replay = Replay(num_envs=2, length=7)
