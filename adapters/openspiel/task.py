@@ -16,9 +16,10 @@ import os
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import jax
 import jax.numpy as jnp
@@ -86,7 +87,8 @@ def spec(name: str) -> EnvironmentSpec:
     is remembered in the cache folder.
 
     Args:
-      name: a name in `GAMES`, or a game's short name in the library.
+      name: a name in `GAMES`, or a game's name in the library, with its parameters in the library's own way:
+        "goofspiel(num_cards=4)".
 
     Raises:
       UserError: no such game, or none that can be played here; see `make`.
@@ -105,8 +107,8 @@ def make(name: str, progress: Progress | None = None) -> Environment:
       progress: called with a message and the fraction done; bargaining takes some 20 seconds when it is new.
 
     Raises:
-      UserError: the game is unknown; or its players move at once, or are not two; or what they see is not a vector
-        of symbols.
+      UserError: the game or a parameter is unknown; or its players move at once, or are not two; or what they see is
+        not a vector of symbols.
     """
     name = canonical_name(name)
     tables = _walked(name, progress)
@@ -135,7 +137,7 @@ def _walked(name: str, progress: Progress | None) -> Tables | None:
     report = functools.partial(progress, message) if progress else lambda fraction: None
     report(0.0)
     version = importlib.metadata.version("open_spiel")
-    path = cache_dir() / "openspiel" / f"{name}-{version}-{_builder()}.npz"
+    path = cache_dir() / "openspiel" / f"{quote(name, '(),=')}-{version}-{_builder()}.npz"
     too_large = path.with_name(f"{path.stem}.too_large")  # an empty file
     tables = read_tables(path)
     if tables is None and not too_large.exists():
@@ -340,7 +342,7 @@ def _fully_observed(game: Any) -> bool:
 
 
 def _not_categorical(name: str) -> UserError:
-    return UserError(f"openspiel/{name} cannot be played here: its observations are not whole numbers from 0 to 255")
+    return _not_played(name, "its observations are not whole numbers from 0 to 255")
 
 
 def _engine(name: str) -> Any:
@@ -348,33 +350,63 @@ def _engine(name: str) -> Any:
     import pyspiel
 
     kinds = {kind.short_name: kind for kind in pyspiel.registered_games()}
-    identifier = GAMES.get(name, name)
+    short, bracket, parameters = name.partition("(")
+    identifier = GAMES.get(short, short)
     if identifier not in kinds:
-        turns = pyspiel.GameType.Dynamics.SEQUENTIAL
-        playable = {
-            kind.short_name
-            for kind in kinds.values()
-            if kind.default_loadable and kind.dynamics == turns and kind.min_num_players <= 2 <= kind.max_num_players
-        }
-        raise UserError(f"unknown game openspiel/{name}: {did_you_mean(name, {*GAMES, *playable})}")
+        playable = {id for id, kind in kinds.items() if kind.default_loadable and not _obstacle(kind)}
+        raise UserError(f"unknown game openspiel/{name}: {did_you_mean(short, {*GAMES, *playable})}")
     kind = kinds[identifier]
-    dynamics, chance = pyspiel.GameType.Dynamics, pyspiel.GameType.ChanceMode
-    game = pyspiel.load_game(identifier) if kind.default_loadable else None
-    if game is None:
-        reason = "it is made of another game, which an id cannot name"
-    elif game.num_players() != 2:
-        reason = f"it has {game.num_players()} player{'s' if game.num_players() > 1 else ''}, not two"
-    elif kind.dynamics == dynamics.SIMULTANEOUS:
-        reason = "its players move simultaneously; only games in which they take turns can be"
-    elif kind.dynamics != dynamics.SEQUENTIAL:
-        reason = "its players do not take turns"
-    elif not kind.provides_observation_tensor:
-        reason = "the library gives no observation tensor for it"
-    elif kind.chance_mode == chance.SAMPLED_STOCHASTIC:
-        reason = "it does not tell the probabilities of its chance events"
-    else:
-        return game
-    raise UserError(f"openspiel/{name} cannot be played here: {reason}")
+    if not (bracket or kind.default_loadable):
+        needed = "game=tic_tac_toe()" if "game" in kind.parameter_specification else f"{[*kind.parameter_specification][0]}=..."
+        raise _not_played(name, f"it needs parameters, as in {identifier}({needed})")
+    try:
+        with _silent_stderr():
+            game = pyspiel.load_game(identifier + bracket + parameters)
+    except pyspiel.SpielError as error:
+        raise _not_played(name, " ".join(str(error).split())) from error
+    kind, players = game.get_type(), game.num_players()
+    if players != 2:
+        more = f"; {identifier}(players=2) has" if "players" in kind.parameter_specification else ""
+        raise _not_played(name, f"it has {players} player{'s' if players > 1 else ''}, not two{more}")
+    if kind.dynamics == pyspiel.GameType.Dynamics.SIMULTANEOUS:
+        in_turns = f"openspiel/turn_based_simultaneous_game(game={identifier}{bracket}{parameters or '()'})"
+        raise _not_played(name, f"its players move simultaneously; in {in_turns} they take turns")
+    obstacle = _obstacle(kind)
+    if obstacle:
+        raise _not_played(name, obstacle)
+    return game
+
+
+def _obstacle(kind: Any) -> str:
+    """Why games of this type, whatever their parameters, cannot be played here; "" if they can."""
+    import pyspiel
+
+    if not kind.min_num_players <= 2 <= kind.max_num_players:
+        return "it is not for two players"
+    if kind.dynamics != pyspiel.GameType.Dynamics.SEQUENTIAL:
+        return "its players do not take turns"
+    if not kind.provides_observation_tensor:
+        return "the library gives no observation tensor for it"
+    if kind.chance_mode == pyspiel.GameType.ChanceMode.SAMPLED_STOCHASTIC:
+        return "it does not tell the probabilities of its chance events"
+    return ""
+
+
+def _not_played(name: str, reason: str) -> UserError:
+    return UserError(f"openspiel/{name} cannot be played here: {reason}")
+
+
+@contextlib.contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """The library writes there what it raises besides."""
+    kept = os.dup(2)
+    with open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def read_tables(path: Path) -> Tables | None:

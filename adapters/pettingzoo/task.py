@@ -1,6 +1,6 @@
 """PettingZoo's environments as tasks, played on the host (`suite.interface.host`): `pettingzoo/<id>`.
 
-A game of two agents is a task if it has discrete actions, an action mask and observations of small integers.
+A game of two agents is a task if it has discrete actions and observations of small whole numbers.
 
 Importing this module imports no game and no JAX.
 """
@@ -8,24 +8,21 @@ Importing this module imports no game and no JAX.
 from __future__ import annotations
 
 import functools
-import math
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pettingzoo
 from gymnasium import spaces
 
+from adapters.gymnasium.observations import MAX_CATEGORIES, Encode, UnseenError, symbols
 from adapters.gymnasium.task import distribution, one_line
-from suite.runtime.errors import UserError, did_you_mean
+from suite.runtime.errors import RunError, UserError, did_you_mean
 
 if TYPE_CHECKING:
     from suite.interface.environment import Environment, EnvironmentSpec
     from suite.interface.host import HostStep
-
-MAX_HIGH = 255
-
 
 class PettingZooTask(NamedTuple):
     """An imported game: what it is, and how to make an engine."""
@@ -35,36 +32,63 @@ class PettingZooTask(NamedTuple):
 
 
 class PettingZooEngine:
-    """An AEC environment as a host engine; see `suite.interface.host.HostEngine`."""
+    """An AEC environment of two agents as a host engine; see `suite.interface.host.HostEngine`.
 
-    def __init__(self, env: pettingzoo.AECEnv):
-        self.env = env
+    A game goes on as long as one of them lives: for the dead nobody acts, and they go on seeing what they saw last. All
+    actions are legal where neither an agent's observation nor its info has an "action_mask".
+    """
+
+    def __init__(self, env: pettingzoo.AECEnv, encoders: list[Encode]):
+        self.env, self._encoders = env, encoders
+        self._first_action = int(env.action_space(env.possible_agents[0]).start)
 
     def reset(self, seed: int) -> HostStep:
         self.env.reset(seed=seed)
-        return self._show(first=True)
+        self._seen: dict[str, np.ndarray] = {}
+        return self._show(np.zeros(2, np.float32))
 
     def step(self, action: int) -> HostStep:
-        self.env.step(action)
-        return self._show(first=False)
+        env = self.env
+        env.step(self._first_action + action)
+        rewards = np.array([env.rewards.get(agent, 0.0) for agent in env.possible_agents], np.float32)
+        while not self._over() and self._dead(env.agent_selection):
+            env.step(None)
+        return self._show(rewards)
 
-    def _show(self, first: bool) -> HostStep:
+    def _dead(self, agent: str) -> bool:
+        return self.env.terminations[agent] or self.env.truncations[agent]
+
+    def _over(self) -> bool:
+        return all(map(self._dead, self.env.agents))
+
+    def _show(self, rewards: np.ndarray) -> HostStep:
         from suite.interface.host import HostStep
 
-        env, agents = self.env, self.env.possible_agents
-        seen = [env.observe(agent) for agent in agents]
-        actor = agents.index(env.agent_selection)
-        terminated, truncated = any(env.terminations.values()), any(env.truncations.values())
-        legal_A = np.asarray(seen[actor]["action_mask"], bool) & (not (terminated or truncated))
+        env, actor, over = self.env, self.env.agent_selection, self._over()
+        shown = {agent: env.observe(agent) for agent in env.agents}
+        for agent, encode in zip(env.possible_agents, self._encoders, strict=True):
+            if agent in shown:
+                self._seen[agent] = encode(_parts(shown[agent])["observation"])
+        parts = env.infos.get(actor, {}) | (_parts(shown[actor]) if actor in shown else {})
+        legal_A = np.ones(env.action_space(actor).n, bool) & np.asarray(parts.get("action_mask", True), bool)
+        if not (over or legal_A.any()):
+            raise RunError(f"{actor} has no legal action")
+        terminated = over and any(env.terminations.values())
         return HostStep(
-            observation=np.stack([np.asarray(each["observation"]).reshape(-1).astype(np.uint8) for each in seen]),
-            reward=np.array([0.0 if first else env.rewards.get(agent, 0.0) for agent in agents], np.float32),
+            observation=np.stack([self._seen[agent] for agent in env.possible_agents]),
+            reward=rewards,
             terminated=terminated,
-            truncated=truncated and not terminated,
-            player=actor + 1,
-            legal_A=legal_A,
+            truncated=over and not terminated,
+            player=env.possible_agents.index(actor) + 1,
+            legal_A=legal_A & (not over),
             chance_C=np.zeros(0, np.float32),
         )
+
+
+def _parts(observed: Any) -> Any:
+    """An observation, or a space of them, by parts: "observation" and, if there is one, "action_mask"."""
+    parts = observed.spaces if isinstance(observed, spaces.Dict) else observed
+    return parts if isinstance(parts, dict) and "observation" in parts else {"observation": observed}
 
 
 def spec(id: str) -> EnvironmentSpec:
@@ -106,35 +130,39 @@ def make(id: str, progress: Callable[[str, float], None] | None = None) -> Envir
 @functools.lru_cache(maxsize=16)
 def _imported(id: str) -> PettingZooTask:
     from suite.interface.environment import EnvironmentSpec, ObservationSpec
-    from suite.interface.host import random_rewards, reward_classes
+    from suite.interface.host import random_play, reward_classes, rewards_of
 
     env = _make(id)
-    if len(env.possible_agents) != 2:
-        raise _unsupported(id, f"it has {len(env.possible_agents)} agents, not two")
+    count = len(env.possible_agents)
+    if count != 2:
+        raise _unsupported(id, f"it has {count} agent{'s' if count != 1 else ''}, not two")
     actions, observed = [
         [ask(agent) for agent in env.possible_agents] for ask in (env.action_space, env.observation_space)
     ]
-    if not all(isinstance(space, spaces.Discrete) and space.start == 0 for space in actions) or actions[0].n < 2:
-        raise _unsupported(id, "its actions are not Discrete with two or more, from 0")
-    if not all(isinstance(s, spaces.Dict) and {"observation", "action_mask"} <= set(s.spaces) for s in observed):
-        raise _unsupported(id, "its observations have no action mask")
-    highs = [_high(space["observation"]) for space in observed]
-    sizes = [int(np.prod(space["observation"].shape, dtype=int)) for space in observed]
-    if any(high > MAX_HIGH for high in highs):
-        raise _unsupported(id, f"its observations are not integers from 0 to at most {MAX_HIGH}")
-    if actions[0] != actions[1] or sizes[0] != sizes[1]:
+    if not all(isinstance(space, spaces.Discrete) for space in actions) or actions[0].n < 2:
+        raise _unsupported(id, "its actions are not Discrete with two or more")
+    try:
+        seen = [symbols(_parts(space)["observation"]) for space in observed]
+    except UnseenError:
+        seen = []
+    known = [each for each in seen if each is not None]
+    if len(known) < 2:
+        raise _unsupported(id, f"its observations are not whole numbers of at most {MAX_CATEGORIES} values")
+    if actions[0] != actions[1] or known[0].spec.shape != known[1].spec.shape:
         raise _unsupported(id, "its two agents have different spaces")
+    encoders = [each.encode for each in known]
+    play = random_play(f"pettingzoo/{id}", PettingZooEngine(env, encoders), int(actions[0].n))
     task = EnvironmentSpec(
         id=f"pettingzoo/{id}",
-        observation=ObservationSpec((sizes[0],), max(int(max(highs)), 1), "symbols"),
+        observation=ObservationSpec(known[0].spec.shape, max(each.spec.high for each in known), "symbols"),
         num_actions=int(actions[0].n),
-        reward_classes=reward_classes({-1.0, 1.0} | random_rewards(PettingZooEngine(env), int(actions[0].n))),
+        reward_classes=reward_classes({-1.0, 1.0} | rewards_of(play)),
         statistics=(("seat", ()),),
         package=distribution(env.unwrapped),
         two_player=True,
     )
     env.close()
-    return PettingZooTask(task, lambda: PettingZooEngine(_make(id)))
+    return PettingZooTask(task, lambda: PettingZooEngine(_make(id), encoders))
 
 
 def _make(id: str) -> pettingzoo.AECEnv:
@@ -146,19 +174,6 @@ def _make(id: str) -> pettingzoo.AECEnv:
         return pettingzoo.make("aec", name)
     except Exception as error:  # whatever an optional dependency that is missing leads to
         raise UserError(f"pettingzoo/{id}: {one_line(error)}") from error
-
-
-def _high(space: spaces.Space) -> float:
-    """The largest value of integers from 0; infinite for anything else."""
-    if isinstance(space, spaces.Discrete) and space.start == 0:
-        return int(space.n) - 1
-    if isinstance(space, spaces.MultiDiscrete) and not space.start.any():
-        return int(space.nvec.max()) - 1
-    if isinstance(space, spaces.MultiBinary):
-        return 1
-    if isinstance(space, spaces.Box) and np.dtype(space.dtype).kind in "biu" and not space.low.any():
-        return int(space.high.max())
-    return math.inf
 
 
 def _unsupported(id: str, reason: str) -> UserError:

@@ -21,7 +21,7 @@ from flax import struct
 
 from suite.interface.environment import EnvironmentSpec, TimeStep
 from suite.interface.turns import CHANCE, Turn
-from suite.runtime.errors import RunError
+from suite.runtime.errors import RunError, UserError
 
 LIMIT = 1000  # steps of an episode where an engine names no limit of its own
 FEW_REWARDS, MANY_INTEGERS = 3, 16  # up to so many rewards are their own classes; more share evenly spaced ones
@@ -63,6 +63,40 @@ class HostEngine(Protocol):
         """One step: an action in [0, A), or an outcome in [0, C) where chance acts. Never after an end."""
 
 
+class CheckedEngine:
+    """An engine whose faults are lines that say which engine, which episode and which step of it.
+
+    `reset` and `step` raise a `RunError` where the engine raises anything, pays what is no finite float32, or begins
+    an episode that is over.
+    """
+
+    def __init__(self, id: str, engine: HostEngine):
+        self._id, self._engine = id, engine
+
+    def reset(self, seed: int) -> HostStep:
+        self._seed, self._time = seed, 0
+        host_step = self._checked(self._engine.reset, seed)
+        if host_step.terminated or host_step.truncated:
+            raise RunError(f"{self._id}: the episode of seed {seed} is over before its first step")
+        return host_step
+
+    def step(self, action: int) -> HostStep:
+        self._time += 1
+        return self._checked(self._engine.step, action)
+
+    def _checked(self, call: Callable[[int], HostStep], argument: int) -> HostStep:
+        where = f"{self._id}, step {self._time} of the episode of seed {self._seed}"
+        try:
+            host_step = call(argument)
+        except RunError as error:
+            raise RunError(f"{where}: {error}") from error
+        except Exception as error:  # whatever somebody else's code raises
+            raise RunError(f"{where}: {type(error).__name__}: {' '.join(str(error).split())}") from error
+        if not np.isfinite(host_step.reward).all():
+            raise RunError(f"{where}: the reward is {host_step.reward}, not a finite float32")
+        return host_step
+
+
 @struct.dataclass
 class HostState:
     """What determines an engine.
@@ -92,7 +126,7 @@ class HostEnvironment:
     def __init__(self, spec: EnvironmentSpec, make_engine: Callable[[], HostEngine], limit: int = LIMIT):
         self.spec = spec
         self.limit = limit
-        self._pool = EnginePool(make_engine)
+        self._pool = EnginePool(lambda: CheckedEngine(spec.id, make_engine()))
         flag, integer = jax.ShapeDtypeStruct((), jnp.bool_), jax.ShapeDtypeStruct((), jnp.int32)
         players = (2,) if spec.two_player else ()
         self._result = HostStep(
@@ -229,9 +263,21 @@ def random_steps(engine: HostEngine, num_actions: int, steps: int) -> Iterator[H
             yield host_step
 
 
-def random_rewards(engine: HostEngine, num_actions: int, steps: int = 1000) -> set[float]:
-    """The rewards that `random_steps` pay, and 0: of games, both players'."""
-    return {0.0}.union(*(np.ravel(host_step.reward).tolist() for host_step in random_steps(engine, num_actions, steps)))
+def random_play(id: str, engine: HostEngine, num_actions: int, steps: int = 1000) -> Iterator[HostStep]:
+    """`random_steps` of an engine that nobody has tried yet.
+
+    Raises:
+      UserError: what `CheckedEngine` finds wrong with the engine of the task `id`.
+    """
+    try:
+        yield from random_steps(CheckedEngine(id, engine), num_actions, steps)
+    except RunError as error:
+        raise UserError(str(error)) from error
+
+
+def rewards_of(play: Iterable[HostStep]) -> set[float]:
+    """The rewards of these steps, and 0: of games, both players'."""
+    return {0.0}.union(*(np.ravel(host_step.reward).tolist() for host_step in play))
 
 
 def reward_classes(rewards: Iterable[float]) -> tuple[float, ...]:

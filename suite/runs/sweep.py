@@ -323,12 +323,24 @@ def last_step(folder: Path) -> int:
 def _select(option: str, words: str, known: Iterable[str]) -> list[str]:
     """The ids that these are or match. An id need not be known here: families have more tasks than are listed."""
     chosen: list[str] = []
-    for word in words.split(","):
+    for word in _words(words):
         matching = fnmatch.filter(known, word) if set("*?[") & set(word) else [word]
         if not matching:
             raise UserError(f"{option}: nothing matches {word!r}; valid: {', '.join(sorted(known))}")
         chosen += matching
     return list(dict.fromkeys(chosen))
+
+
+def _words(text: str) -> Iterator[str]:
+    """What commas separate; those in brackets belong to an id, as in "openspiel/dots_and_boxes(num_rows=1,num_cols=1)"."""
+    word = None
+    for part in text.split(","):
+        word = part if word is None else f"{word},{part}"
+        if word.count("(") <= word.count(")"):
+            yield word
+            word = None
+    if word is not None:
+        yield word
 
 
 def _allowed(retries: int | None, died: bool) -> int:

@@ -27,9 +27,10 @@ class RunError(Exception):
 
 
 def did_you_mean(word: str, valid: Iterable[str]) -> str:
-    """A clause that names the nearest valid word, or lists the valid ones when none is near."""
+    """A clause that names the nearest valid word, or one that begins so, or lists the valid ones when none is near."""
     choices = sorted(valid)
-    near = difflib.get_close_matches(word, choices, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(word, choices, n=1, cutoff=0.6)
+    near = near or [choice for choice in choices if len(word) > 2 and choice.startswith(word)]
     if near:
         return f"did you mean {near[0]!r}?"
     return f"valid: {', '.join(choices)}"

@@ -1,0 +1,219 @@
+"""What Gymnasium's spaces hold as uint8 images and symbols. Importing this module imports no game and no JAX."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.spaces.utils import flatten, flatten_space
+
+from suite.runtime.errors import RunError
+
+if TYPE_CHECKING:
+    from suite.interface.environment import ObservationSpec
+
+MAX_PATCHES = 9  # a side, as Craftax-classic has
+MAX_CHANNELS = 16
+MAX_VALUES = 256 * 256 * 4  # of an image: `small` keeps 32,000 of them, 8 GiB
+MAX_CATEGORIES = 256
+MAX_SYMBOLS = 128
+QUANTILES = 32
+BEYOND = 2.0 ** np.arange(-3, 4)  # times the range seen: edges of bins outside of it
+
+Encode = Callable[[Any], np.ndarray]
+
+
+class Seen(NamedTuple):
+    """How an observation becomes one of ours."""
+
+    spec: ObservationSpec
+    encode: Encode
+
+
+class UnseenError(ValueError):
+    """A space whose observations cannot become ours: what they are."""
+
+
+def seen(space: spaces.Space, play: Callable[[Encode], Iterable[np.ndarray]]) -> Seen:
+    """How observations of this space become ours.
+
+    Boxes of two or three axes are images if they are uint8 or have more than 128 values: channels are the last axis, or
+    the first where that leaves an image; floats between two bounds become 0 to 255. Of a `Dict` with an "image" that is
+    seen. All else is flattened (`gymnasium.spaces.utils.flatten`) to a vector of at most 128 symbols: see `symbols`;
+    a larger `Discrete` becomes digits, and all other numbers bins (`Bins`).
+
+    Args:
+      space: of the observations.
+      play: shows the observations of random play, each as the function that it is given makes it.
+
+    Raises:
+      UnseenError: they cannot.
+    """
+    from suite.interface.environment import ObservationSpec
+
+    if isinstance(space, spaces.Dict) and "image" in space.spaces:
+        inner = seen(space["image"], play)
+        return Seen(inner.spec, lambda observation: inner.encode(observation["image"]))
+    if isinstance(space, spaces.Discrete) and space.n > MAX_CATEGORIES:
+        return _digits(int(space.n), int(space.start))
+    if isinstance(space, spaces.Box) and len(space.shape) in (2, 3):
+        if space.dtype == np.uint8 or math.prod(space.shape) > MAX_SYMBOLS:
+            return _image(space)
+    box, vector = _as_vector(space)
+    size = math.prod(box.shape)
+    if not 1 <= size <= MAX_SYMBOLS:
+        raise UnseenError(f"{size} numbers; up to {MAX_SYMBOLS} can be symbols, images are uint8 or of floats in bounds")
+    found = symbols(space)
+    if found is None:
+        bins = Bins(np.stack([*play(vector)]), box.low.ravel(), box.high.ravel())
+        spec = ObservationSpec((size,), bins.high, "symbols")
+        found = Seen(spec, lambda observation: bins(vector(observation)))
+    return found
+
+
+def symbols(space: spaces.Space) -> Seen | None:
+    """Whole numbers of up to 256 values each as symbols, flattened, each from its lowest value on; None if it is not so.
+
+    Raises:
+      UnseenError: the space cannot be flattened.
+    """
+    from suite.interface.environment import ObservationSpec
+
+    box, vector = _as_vector(space)
+    low_O = box.low.ravel()
+    if box.dtype.kind not in "biu" or (box.high.ravel().astype(float) - low_O).max(initial=0) >= MAX_CATEGORIES:
+        return None
+    low_O = low_O.astype(np.int64)
+    high = max(int((box.high.ravel() - low_O).max(initial=0)), 1)
+    spec = ObservationSpec(low_O.shape, high, "symbols")
+    return Seen(spec, lambda observation: _within(vector(observation).astype(np.int64) - low_O, high))
+
+
+class Bins:
+    """Numbers as bins: 32 quantiles of what random play shows and, as a good policy may leave that, bins outside of it.
+
+    Equal numbers count once, so up to 32 values that are shown have a bin each. The outer edges are at 1/8, 1/4, ..., 8
+    times the range shown (1 where it is a single number) on either side, as far as the space's bounds; the last bins
+    hold all that lies further out.
+
+    Args:
+      shown_NO: float, the observations of random play.
+      low_O, high_O: bounds of the space.
+    """
+
+    def __init__(self, shown_NO: np.ndarray, low_O: np.ndarray, high_O: np.ndarray):
+        edges = [_edges(*of_one) for of_one in zip(shown_NO.T, low_O, high_O, strict=True)]
+        self.high = max(1, *map(len, edges))
+        self._edges_OE = np.array([np.pad(e, (0, self.high - len(e)), constant_values=np.inf) for e in edges])
+
+    def __call__(self, number_O: np.ndarray) -> np.ndarray:
+        """uint8 [O]: how many edges lie below each number."""
+        return (number_O[:, None] > self._edges_OE).sum(1).astype(np.uint8)
+
+
+def _edges(shown_N: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Ascending edges of one dimension's bins."""
+    distinct = np.unique(shown_N[np.isfinite(shown_N)])
+    if not len(distinct):
+        distinct = np.zeros(1)
+    # To six digits: another processor may compute the last ones of what is shown otherwise.
+    inner = np.array([float(f"{n:.6g}") for n in np.quantile(distinct, np.linspace(0, 1, QUANTILES), method="nearest")])
+    width = float(inner[-1] - inner[0]) or 1.0
+    outer = np.concatenate([inner[0] - width * BEYOND, inner[-1] + width * BEYOND])
+    return np.unique(np.concatenate([inner, outer[(outer > low) & (outer < high)]]))
+
+
+def _as_vector(space: spaces.Space) -> tuple[spaces.Box, Encode]:
+    """A space as a box, and what makes a vector of what it holds; the function raises a `RunError` of a NaN."""
+    flat: Encode = np.asarray
+    if isinstance(space, spaces.Discrete):
+        box = spaces.Box(space.start, space.start + space.n - 1, (1,), np.int64)
+    elif isinstance(space, spaces.MultiDiscrete):
+        box = spaces.Box(space.start, space.start + space.nvec - 1, dtype=np.int64)
+    elif isinstance(space, spaces.MultiBinary):
+        box = spaces.Box(0, 1, space.shape, np.int8)
+    elif isinstance(space, spaces.Box):
+        box = space
+    elif space.is_np_flattenable:
+        box, flat = flatten_space(space), lambda observation: flatten(space, observation)
+    else:
+        raise UnseenError(f"{type(space).__name__}, which cannot be flattened")
+    return box, lambda observation: _without_nan(flat(observation)).reshape(box.shape).ravel()
+
+
+def _digits(categories: int, start: int) -> Seen:
+    """As few equally large digits as hold the categories, the most significant one first."""
+    from suite.interface.environment import ObservationSpec
+
+    count = next(n for n in itertools.count(1) if MAX_CATEGORIES**n >= categories)
+    base = next(b for b in itertools.count(1) if b**count >= categories)
+
+    def encode(observation: Any) -> np.ndarray:
+        number = int(_within(np.array([int(observation) - start]), categories - 1, np.int64)[0])
+        return np.array([number // base**place % base for place in reversed(range(count))], np.uint8)
+
+    return Seen(ObservationSpec((count,), base - 1, "symbols"), encode)
+
+
+def _image(space: spaces.Box) -> Seen:
+    """[height, width], [height, width, channels] or [channels, height, width] as an image with channels last."""
+    from suite.interface.environment import ObservationSpec
+
+    rows, columns, channels = sides = space.shape if len(space.shape) == 3 else (*space.shape, 1)
+    channels_first = rows < channels and rows != columns
+    if channels_first:
+        channels, rows, columns = sides
+    low, high = float(space.low.min()), float(space.high.max())
+    whole = space.dtype.kind in "biu"
+    if channels > MAX_CHANNELS or rows * columns * channels > MAX_VALUES:
+        raise UnseenError(
+            f"{space.shape}, not [height, width] with up to {MAX_CHANNELS} channels before or behind and at most "
+            f"{MAX_VALUES:,} values; gymnasium.wrappers has ResizeObservation"
+        )
+    if not (0 <= low < high <= 255 if whole else -math.inf < low < high < math.inf):
+        raise UnseenError(f"an image from {low:g} to {high:g}, not of integers from 0 to at most 255 or floats in bounds")
+
+    def encode(observation: Any) -> np.ndarray:
+        image = np.asarray(observation).reshape(sides)
+        image = np.moveaxis(image, 0, -1) if channels_first else image
+        if space.dtype == np.uint8:
+            return image
+        if whole:
+            return _within(image, high)
+        return np.round(255 * np.clip((_without_nan(image) - low) / (high - low), 0, 1)).astype(np.uint8)
+
+    levels = int(high) if whole else 255
+    kind = "pixels" if levels == 255 else "grid"
+    return Seen(ObservationSpec((rows, columns, channels), levels, kind, patch(rows, columns)), encode)
+
+
+def _without_nan(numbers: np.ndarray) -> np.ndarray:
+    if np.isnan(numbers).any():
+        raise RunError("the observation holds nan")
+    return numbers
+
+
+def _within(integers: np.ndarray, high: float, dtype: Any = np.uint8) -> np.ndarray:
+    """The same in another type. Raises a `RunError` where one is below 0 or above `high`."""
+    wrong = integers[(integers < 0) | (integers > high)]
+    if wrong.size:
+        raise RunError(f"the observation holds what its space does not: {wrong.flat[0]} of 0 to {high:g}")
+    return integers.astype(dtype)
+
+
+def patch(height: int, width: int) -> tuple[int, int]:
+    """The smallest patch with at most nine a side: a square that divides both sides, or else each side by itself."""
+    square = next((n for n in range(1, math.gcd(height, width) + 1) if _tiles(height, n) and _tiles(width, n)), None)
+    if square is not None:
+        return square, square
+    rows = next(n for n in range(1, height + 1) if _tiles(height, n))
+    columns = next(n for n in range(1, width + 1) if _tiles(width, n))
+    return rows, columns
+
+
+def _tiles(side: int, patch: int) -> bool:
+    return side % patch == 0 and side // patch <= MAX_PATCHES
