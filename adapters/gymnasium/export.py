@@ -7,6 +7,8 @@ Gymnasium loads no plug-ins, so its registry knows ours once `adapters` is impor
 from __future__ import annotations
 
 import functools
+import os
+import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +21,7 @@ from suite import registry
 from suite.runtime.errors import UserError
 
 if TYPE_CHECKING:
-    from suite.interface.environment import Environment, ObservationSpec, TimeStep
+    from suite.interface.environment import Environment, EnvironmentSpec, ObservationSpec, TimeStep
 
 NAMESPACE = "suite"
 NOT_EXPORTED = ("openspiel", "pettingzoo", "gymnasium")  # families: games of two players, and Gymnasium's own
@@ -57,26 +59,28 @@ class SuiteEnv(gymnasium.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(self, task: str | Environment, render_mode: str | None = None):
-        environment: Any = _environment(task)
-        spec = environment.spec.observation
-        in_colour = spec.kind == "pixels" and spec.shape[-1] == 3
+        spec = single_agent_spec(task)
+        in_colour = spec.observation.kind == "pixels" and spec.observation.shape[-1] == 3
         if render_mode is not None and not (render_mode == "rgb_array" and in_colour):
-            raise UserError(f"{environment.spec.id} cannot be rendered as {render_mode!r}")
+            raise UserError(f"{spec.id} cannot be rendered as {render_mode!r}")
         self.metadata = {**self.metadata, "render_modes": ["rgb_array"] if in_colour else []}
         self.render_mode = render_mode
-        self.observation_space = observation_space(spec)
-        self.action_space = spaces.Discrete(environment.spec.num_actions)
-        self._reset, self._step = _programs(environment)
+        self.observation_space = observation_space(spec.observation)
+        self.action_space = spaces.Discrete(spec.num_actions)
+        self._task: Any = task
+        self._programs: Any = None  # made by the first reset: one that only shows its spaces must not use JAX
         self._key: Any = None
         self._state: Any = None
         self._frame: np.ndarray | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """A new episode; `options` are not used."""
+        """A new episode; `options` are not used. Raises a `UserError` in a fork of a process that used JAX."""
+        _refuse_forks()
         super().reset(seed=seed)
+        self._programs = self._programs or _programs(self._task)
         if seed is not None or self._key is None:
             self._key = _first_key(self.np_random if seed is None else seed)
-        self._key, self._state, time_step = self._reset(self._key)
+        self._key, self._state, time_step = self._programs[0](self._key)
         return self._observation(time_step), _episode(time_step)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -90,7 +94,7 @@ class SuiteEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded("the episode has ended or none was begun: call reset() first")
         if not self.action_space.contains(action):
             raise gymnasium.error.InvalidAction(f"{action!r} is no action of {self.action_space}")
-        self._key, self._state, time_step = self._step(self._key, self._state, np.int32(action))
+        self._key, self._state, time_step = self._programs[1](self._key, self._state, np.int32(action))
         observation = self._observation(time_step)
         terminated, truncated = bool(time_step.terminated), bool(time_step.truncated)
         if terminated or truncated:
@@ -127,15 +131,16 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv):
     metadata = {"render_modes": [], "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}  # noqa: RUF012
 
     def __init__(self, task: str | Environment, num_envs: int = 1, render_mode: str | None = None):
-        environment: Any = _environment(task)
+        spec = single_agent_spec(task)
         if render_mode is not None:
-            raise UserError(f"vectors of {environment.spec.id} cannot be rendered; make a single environment")
+            raise UserError(f"vectors of {spec.id} cannot be rendered; make a single environment")
         self.num_envs = num_envs
-        self.single_observation_space = observation_space(environment.spec.observation)
-        self.single_action_space = spaces.Discrete(environment.spec.num_actions)
+        self.single_observation_space = observation_space(spec.observation)
+        self.single_action_space = spaces.Discrete(spec.num_actions)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._reset, self._step = _programs(environment, num_envs)
+        self._task: Any = task
+        self._programs: Any = None  # made by the first reset
         self._key: Any = None
         self._state: Any = None
 
@@ -147,16 +152,18 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv):
           options: not used; in particular no single environment can be reset.
 
         Raises:
-          UserError: a list of seeds, or a mask of environments.
+          UserError: a list of seeds, or a mask of environments, or this is a fork of a process that used JAX.
         """
         if seed is not None and not isinstance(seed, (int, np.integer)):
             raise UserError(f"a suite vector takes one seed for all its environments, not {seed!r}")
         if options and "reset_mask" in options:
             raise UserError("a suite vector resets what ended by itself; reset_mask is not supported")
+        _refuse_forks()
         super().reset(seed=None if seed is None else int(seed))
+        self._programs = self._programs or _programs(self._task, self.num_envs)
         if seed is not None or self._key is None:
             self._key = _first_key(self.np_random if seed is None else seed)
-        self._key, self._state, time_step = self._reset(self._key)
+        self._key, self._state, time_step = self._programs[0](self._key)
         info = _masked(time_step.statistics, np.ones(self.num_envs, bool))
         return _as_in(self.observation_space, time_step.observation), info
 
@@ -171,7 +178,7 @@ class SuiteVectorEnv(gymnasium.vector.VectorEnv):
             raise gymnasium.error.ResetNeeded("no episodes were begun: call reset() first")
         if not self.action_space.contains(np.asarray(actions)):
             raise gymnasium.error.InvalidAction(f"{actions!r} are no actions of {self.action_space}")
-        self._key, self._state, time_step = self._step(self._key, self._state, np.asarray(actions, np.int32))
+        self._key, self._state, time_step = self._programs[1](self._key, self._state, np.asarray(actions, np.int32))
         ended_B = time_step.terminated | time_step.truncated
         info = _masked(time_step.statistics, ~ended_B)
         if ended_B.any():
@@ -197,21 +204,46 @@ def _built(id: str) -> Environment:
     return registry.task(id).make()()
 
 
-def _environment(task: str | Environment) -> Environment:
-    environment = _built(task) if isinstance(task, str) else task
-    if environment.spec.two_player:
-        id = environment.spec.id
-        raise UserError(f"{id} is a game of two players: use adapters.pettingzoo.export.env({id!r})")
-    return environment
+def single_agent_spec(task: Any) -> EnvironmentSpec:
+    """What a task or an environment is, without building it. Raises a `UserError` of a game of two players."""
+    spec = registry.task(task).spec() if isinstance(task, str) else task.spec
+    if spec.two_player:
+        raise UserError(f"{spec.id} is a game of two players: use adapters.pettingzoo.export.env({spec.id!r})")
+    return spec
+
+
+_user_of_jax: int | None = (
+    None  # the first process that had used JAX when it was forked, this one or what it comes from
+)
+
+
+def _note_user_of_jax() -> None:
+    global _user_of_jax
+    bridge = sys.modules.get("jax._src.xla_bridge")
+    if _user_of_jax is None and bridge is not None and bridge.backends_are_initialized():
+        _user_of_jax = os.getpid()
+
+
+os.register_at_fork(before=_note_user_of_jax)
+
+
+def _refuse_forks() -> None:
+    """JAX's threads are not in a fork: a program would wait for them for ever."""
+    if _user_of_jax not in (None, os.getpid()):
+        raise UserError(
+            "JAX was used before this process was forked from another, and would hang here: use AsyncVectorEnv(..., "
+            'context="spawn"), or gymnasium.make_vec, which steps all environments in one program'
+        )
 
 
 @functools.lru_cache(maxsize=16)
-def _programs(environment: Environment, num_envs: int | None = None) -> tuple[Callable, Callable]:
-    """Compiled reset and step that carry the stream of keys, shared by all who play this environment."""
+def _programs(task: Any, num_envs: int | None = None) -> tuple[Callable, Callable]:
+    """Compiled reset and step of a task or an environment, that carry the stream of keys; shared by all who play it."""
     import jax
 
     from suite.interface.batching import Batched
 
+    environment = _built(task) if isinstance(task, str) else task
     played: Any = environment if num_envs is None else Batched(environment, num_envs)
 
     def reset(key):

@@ -28,7 +28,7 @@ Encode = Callable[[Any], np.ndarray]
 
 
 class Seen(NamedTuple):
-    """How an observation becomes one of ours."""
+    """How an observation becomes one of ours; `encode` raises a `RunError` where it holds what its space does not."""
 
     spec: ObservationSpec
     encode: Encode
@@ -43,8 +43,8 @@ def seen(space: spaces.Space, play: Callable[[Encode], Iterable[np.ndarray]]) ->
 
     Boxes of two or three axes are images if they are uint8 or have more than 128 values: channels are the last axis, or
     the first where that leaves an image; floats between two bounds become 0 to 255. Of a `Dict` with an "image" that is
-    seen. All else is flattened (`gymnasium.spaces.utils.flatten`) to a vector of at most 128 symbols: see `symbols`;
-    a larger `Discrete` becomes digits, and all other numbers bins (`Bins`).
+    seen. All else is flattened to a vector of at most 128 symbols: see `symbols`; a larger `Discrete` becomes digits,
+    and all other numbers bins (`Bins`).
 
     Args:
       space: of the observations.
@@ -60,37 +60,37 @@ def seen(space: spaces.Space, play: Callable[[Encode], Iterable[np.ndarray]]) ->
         return Seen(inner.spec, lambda observation: inner.encode(observation["image"]))
     if isinstance(space, spaces.Discrete) and space.n > MAX_CATEGORIES:
         return _digits(int(space.n), int(space.start))
-    if isinstance(space, spaces.Box) and len(space.shape) in (2, 3):
-        if space.dtype == np.uint8 or math.prod(space.shape) > MAX_SYMBOLS:
-            return _image(space)
-    box, vector = _as_vector(space)
-    size = math.prod(box.shape)
+    large = isinstance(space, spaces.Box) and (space.dtype == np.uint8 or math.prod(space.shape) > MAX_SYMBOLS)
+    if isinstance(space, spaces.Box) and large and len(space.shape) in (2, 3):
+        return _image(space)
+    low_O, high_O, vector = _as_vector(space)
+    size = len(low_O)
     if not 1 <= size <= MAX_SYMBOLS:
-        raise UnseenError(f"{size} numbers; up to {MAX_SYMBOLS} can be symbols, images are uint8 or of floats in bounds")
-    found = symbols(space)
-    if found is None:
-        bins = Bins(np.stack([*play(vector)]), box.low.ravel(), box.high.ravel())
-        spec = ObservationSpec((size,), bins.high, "symbols")
-        found = Seen(spec, lambda observation: bins(vector(observation)))
-    return found
+        raise UnseenError(
+            f"{size} numbers; 1 to {MAX_SYMBOLS} can be symbols, and images are uint8 or floats in bounds"
+        )
+    whole = symbols(space)
+    if whole is not None:
+        return whole
+    bins = Bins(np.stack([*play(vector)]), low_O, high_O)
+    return Seen(ObservationSpec((size,), bins.high, "symbols"), lambda observation: bins(vector(observation)))
 
 
 def symbols(space: spaces.Space) -> Seen | None:
-    """Whole numbers of up to 256 values each as symbols, flattened, each from its lowest value on; None if it is not so.
+    """Whole numbers of up to 256 values each as symbols, flattened, each from its lowest value on; None: not such.
 
     Raises:
       UnseenError: the space cannot be flattened.
     """
     from suite.interface.environment import ObservationSpec
 
-    box, vector = _as_vector(space)
-    low_O = box.low.ravel()
-    if box.dtype.kind not in "biu" or (box.high.ravel().astype(float) - low_O).max(initial=0) >= MAX_CATEGORIES:
+    low_O, high_O, vector = _as_vector(space)
+    if low_O.dtype.kind not in "biu" or (high_O.astype(float) - low_O).max(initial=0) >= MAX_CATEGORIES:
         return None
     low_O = low_O.astype(np.int64)
-    high = max(int((box.high.ravel() - low_O).max(initial=0)), 1)
+    high = max(int((high_O - low_O).max(initial=0)), 1)
     spec = ObservationSpec(low_O.shape, high, "symbols")
-    return Seen(spec, lambda observation: _within(vector(observation).astype(np.int64) - low_O, high))
+    return Seen(spec, lambda observation: _within(vector(observation).astype(np.int64) - low_O, high).astype(np.uint8))
 
 
 class Bins:
@@ -106,8 +106,8 @@ class Bins:
     """
 
     def __init__(self, shown_NO: np.ndarray, low_O: np.ndarray, high_O: np.ndarray):
-        edges = [_edges(*of_one) for of_one in zip(shown_NO.T, low_O, high_O, strict=True)]
-        self.high = max(1, *map(len, edges))
+        edges = [_edges(*dimension) for dimension in zip(shown_NO.T, low_O, high_O, strict=True)]
+        self.high = max(1, *map(len, edges))  # the last bin
         self._edges_OE = np.array([np.pad(e, (0, self.high - len(e)), constant_values=np.inf) for e in edges])
 
     def __call__(self, number_O: np.ndarray) -> np.ndarray:
@@ -117,32 +117,37 @@ class Bins:
 
 def _edges(shown_N: np.ndarray, low: float, high: float) -> np.ndarray:
     """Ascending edges of one dimension's bins."""
-    distinct = np.unique(shown_N[np.isfinite(shown_N)])
-    if not len(distinct):
-        distinct = np.zeros(1)
+    distinct = np.unique(shown_N[np.isfinite(shown_N)]) if np.isfinite(shown_N).any() else np.zeros(1)
+    quantiles = np.quantile(distinct, np.linspace(0, 1, QUANTILES), method="nearest")
     # To six digits: another processor may compute the last ones of what is shown otherwise.
-    inner = np.array([float(f"{n:.6g}") for n in np.quantile(distinct, np.linspace(0, 1, QUANTILES), method="nearest")])
+    inner = np.array([float(f"{quantile:.6g}") for quantile in quantiles])
     width = float(inner[-1] - inner[0]) or 1.0
     outer = np.concatenate([inner[0] - width * BEYOND, inner[-1] + width * BEYOND])
     return np.unique(np.concatenate([inner, outer[(outer > low) & (outer < high)]]))
 
 
-def _as_vector(space: spaces.Space) -> tuple[spaces.Box, Encode]:
-    """A space as a box, and what makes a vector of what it holds; the function raises a `RunError` of a NaN."""
-    flat: Encode = np.asarray
+def _as_vector(space: spaces.Space) -> tuple[np.ndarray, np.ndarray, Encode]:
+    """The bounds of the numbers that a space holds, one after another, and what makes a vector of these numbers.
+
+    Nested spaces are flattened by Gymnasium's own functions: a `Discrete` in them has one number for each category.
+    """
+    low: np.ndarray
+    high: np.ndarray
     if isinstance(space, spaces.Discrete):
-        box = spaces.Box(space.start, space.start + space.n - 1, (1,), np.int64)
+        low, high = np.array(int(space.start)), np.array(int(space.start + space.n) - 1)
     elif isinstance(space, spaces.MultiDiscrete):
-        box = spaces.Box(space.start, space.start + space.nvec - 1, dtype=np.int64)
+        low = np.asarray(space.start)
+        high = low + np.asarray(space.nvec) - 1
     elif isinstance(space, spaces.MultiBinary):
-        box = spaces.Box(0, 1, space.shape, np.int8)
+        low, high = np.zeros(space.shape, np.int8), np.ones(space.shape, np.int8)
     elif isinstance(space, spaces.Box):
-        box = space
-    elif space.is_np_flattenable:
-        box, flat = flatten_space(space), lambda observation: flatten(space, observation)
+        low, high = space.low, space.high
+    elif isinstance(box := flatten_space(space), spaces.Box):
+        low, high, _ = _as_vector(box)
+        return low, high, lambda observation: _number(flatten(space, observation)).reshape(low.shape)
     else:
-        raise UnseenError(f"{type(space).__name__}, which cannot be flattened")
-    return box, lambda observation: _without_nan(flat(observation)).reshape(box.shape).ravel()
+        raise UnseenError(f"{type(space).__name__}, which cannot be flattened to numbers")
+    return np.ravel(low), np.ravel(high), lambda observation: _number(observation).reshape(np.shape(low)).ravel()
 
 
 def _digits(categories: int, start: int) -> Seen:
@@ -153,7 +158,7 @@ def _digits(categories: int, start: int) -> Seen:
     base = next(b for b in itertools.count(1) if b**count >= categories)
 
     def encode(observation: Any) -> np.ndarray:
-        number = int(_within(np.array([int(observation) - start]), categories - 1, np.int64)[0])
+        number = int(_within(np.array(int(observation) - start), categories - 1))
         return np.array([number // base**place % base for place in reversed(range(count))], np.uint8)
 
     return Seen(ObservationSpec((count,), base - 1, "symbols"), encode)
@@ -168,41 +173,41 @@ def _image(space: spaces.Box) -> Seen:
     if channels_first:
         channels, rows, columns = sides
     low, high = float(space.low.min()), float(space.high.max())
-    whole = space.dtype.kind in "biu"
-    if channels > MAX_CHANNELS or rows * columns * channels > MAX_VALUES:
+    whole = np.dtype(space.dtype).kind in "biu"
+    if channels > MAX_CHANNELS or math.prod(sides) > MAX_VALUES:
         raise UnseenError(
-            f"{space.shape}, not [height, width] with up to {MAX_CHANNELS} channels before or behind and at most "
-            f"{MAX_VALUES:,} values; gymnasium.wrappers has ResizeObservation"
+            f"{space.shape}, not [height, width] with up to {MAX_CHANNELS} channels, before or behind, and "
+            f"{MAX_VALUES:,} values (gymnasium.wrappers has ResizeObservation)"
         )
     if not (0 <= low < high <= 255 if whole else -math.inf < low < high < math.inf):
-        raise UnseenError(f"an image from {low:g} to {high:g}, not of integers from 0 to at most 255 or floats in bounds")
+        raise UnseenError(
+            f"{space.shape} from {low:g} to {high:g}, not an image of 0 to at most 255, or floats in bounds"
+        )
 
     def encode(observation: Any) -> np.ndarray:
-        image = np.asarray(observation).reshape(sides)
+        image = _number(observation).reshape(sides)
         image = np.moveaxis(image, 0, -1) if channels_first else image
-        if space.dtype == np.uint8:
-            return image
-        if whole:
-            return _within(image, high)
-        return np.round(255 * np.clip((_without_nan(image) - low) / (high - low), 0, 1)).astype(np.uint8)
+        levels = _within(image, high) if whole else np.round(255 * np.clip((image - low) / (high - low), 0, 1))
+        return levels.astype(np.uint8)
 
-    levels = int(high) if whole else 255
-    kind = "pixels" if levels == 255 else "grid"
-    return Seen(ObservationSpec((rows, columns, channels), levels, kind, patch(rows, columns)), encode)
+    top = int(high) if whole else 255
+    spec = ObservationSpec((rows, columns, channels), top, "pixels" if top == 255 else "grid", patch(rows, columns))
+    return Seen(spec, encode)
 
 
-def _without_nan(numbers: np.ndarray) -> np.ndarray:
-    if np.isnan(numbers).any():
+def _number(observation: Any) -> np.ndarray:
+    """An array without NaN."""
+    array = np.asarray(observation)
+    if array.dtype.kind == "f" and np.isnan(array).any():
         raise RunError("the observation holds nan")
-    return numbers
+    return array
 
 
-def _within(integers: np.ndarray, high: float, dtype: Any = np.uint8) -> np.ndarray:
-    """The same in another type. Raises a `RunError` where one is below 0 or above `high`."""
-    wrong = integers[(integers < 0) | (integers > high)]
-    if wrong.size:
-        raise RunError(f"the observation holds what its space does not: {wrong.flat[0]} of 0 to {high:g}")
-    return integers.astype(dtype)
+def _within(integers: np.ndarray, high: float) -> np.ndarray:
+    """The same, if all are in [0, high]."""
+    if integers.min() < 0 or integers.max() > high:
+        raise RunError(f"the observation holds a number from outside its space, which has {high + 1:g} values")
+    return integers
 
 
 def patch(height: int, width: int) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """`gymnasium/<id>` as a task: a Gymnasium environment played on the host (`suite.interface.host`).
 
-Its actions must be discrete, and its observations images or few numbers (`adapters.gymnasium.observations`). Importing this module imports no
-game and no JAX. Our tasks as Gymnasium environments are in `adapters.gymnasium.export`.
+Its actions must be discrete, and its observations images or few numbers (`adapters.gymnasium.observations`). Importing
+this module imports no game and no JAX. Our tasks as Gymnasium environments are in `adapters.gymnasium.export`.
 """
 
 from __future__ import annotations
@@ -106,13 +106,13 @@ def make(id: str, progress: Callable[[str, float], None] | None = None) -> Envir
 @functools.lru_cache(maxsize=16)
 def _imported(id: str) -> GymnasiumTask:
     from suite.interface.environment import EnvironmentSpec
-    from suite.interface.host import LIMIT, random_play, reward_classes, rewards_of
+    from suite.interface.host import LIMIT, random_play, require_determined, reward_classes, rewards_of
 
     env = _make(id)
     count, native = _actions(id, env.action_space)
     assert env.spec is not None
     if env.spec.nondeterministic:
-        raise _unsupported(id, "it is not determined by its seed")
+        raise _unsupported(id, "its seed does not determine it")
 
     def play(encode: Encode) -> Iterator[HostStep]:
         return random_play(f"gymnasium/{id}", GymnasiumEngine(env, encode, native), count)
@@ -121,6 +121,7 @@ def _imported(id: str) -> GymnasiumTask:
         seen = observations.seen(env.observation_space, lambda encode: (step.observation for step in play(encode)))
     except observations.UnseenError as error:
         raise _unsupported(id, f"its observations are {error}") from error
+    require_determined(f"gymnasium/{id}", lambda: play(seen.encode))
     package = distribution(env.unwrapped)
     limit = env.spec.max_episode_steps or getattr(env.unwrapped, "max_steps", None) or LIMIT
     table = getattr(env.unwrapped, "P", None)
@@ -152,12 +153,14 @@ def _actions(id: str, space: spaces.Space) -> tuple[int, Callable[[int], Any]]:
     Raises:
       UserError: they are not discrete, fewer than two, or too many combinations.
     """
+    choices: np.ndarray
+    start: Any = 0
     if isinstance(space, spaces.Discrete):
-        choices, start = np.array([space.n]), space.start
+        choices, start = np.array([space.n]), int(space.start)
     elif isinstance(space, spaces.MultiDiscrete):
         choices, start = space.nvec, space.start
     elif isinstance(space, spaces.MultiBinary):
-        choices, start = np.full(space.shape, 2), 0
+        choices = np.full(space.shape, 2)
     else:
         raise _unsupported(id, f"its actions are {type(space).__name__}, {DISCRETE}")
     count = math.prod(choices.ravel().tolist())
@@ -166,7 +169,7 @@ def _actions(id: str, space: spaces.Space) -> tuple[int, Callable[[int], Any]]:
 
     def native(action: int) -> Any:
         if isinstance(space, spaces.Discrete):
-            return int(start) + action
+            return start + action
         places = np.array(np.unravel_index(action, choices.ravel())).reshape(space.shape)
         return (start + places).astype(space.dtype)
 

@@ -357,7 +357,8 @@ def _engine(name: str) -> Any:
         raise UserError(f"unknown game openspiel/{name}: {did_you_mean(short, {*GAMES, *playable})}")
     kind = kinds[identifier]
     if not (bracket or kind.default_loadable):
-        needed = "game=tic_tac_toe()" if "game" in kind.parameter_specification else f"{[*kind.parameter_specification][0]}=..."
+        first = next(iter(kind.parameter_specification))
+        needed = "game=tic_tac_toe()" if "game" in kind.parameter_specification else f"{first}=..."
         raise _not_played(name, f"it needs parameters, as in {identifier}({needed})")
     try:
         with _silent_stderr():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from suite.runtime.errors import RunError, UserError, did_you_mean
 if TYPE_CHECKING:
     from suite.interface.environment import Environment, EnvironmentSpec
     from suite.interface.host import HostStep
+
 
 class PettingZooTask(NamedTuple):
     """An imported game: what it is, and how to make an engine."""
@@ -130,7 +131,7 @@ def make(id: str, progress: Callable[[str, float], None] | None = None) -> Envir
 @functools.lru_cache(maxsize=16)
 def _imported(id: str) -> PettingZooTask:
     from suite.interface.environment import EnvironmentSpec, ObservationSpec
-    from suite.interface.host import random_play, reward_classes, rewards_of
+    from suite.interface.host import random_play, require_determined, reward_classes, rewards_of
 
     env = _make(id)
     count = len(env.possible_agents)
@@ -151,12 +152,16 @@ def _imported(id: str) -> PettingZooTask:
     if actions[0] != actions[1] or known[0].spec.shape != known[1].spec.shape:
         raise _unsupported(id, "its two agents have different spaces")
     encoders = [each.encode for each in known]
-    play = random_play(f"pettingzoo/{id}", PettingZooEngine(env, encoders), int(actions[0].n))
+
+    def play() -> Iterator[HostStep]:
+        return random_play(f"pettingzoo/{id}", PettingZooEngine(env, encoders), int(actions[0].n))
+
+    require_determined(f"pettingzoo/{id}", play)
     task = EnvironmentSpec(
         id=f"pettingzoo/{id}",
         observation=ObservationSpec(known[0].spec.shape, max(each.spec.high for each in known), "symbols"),
         num_actions=int(actions[0].n),
-        reward_classes=reward_classes({-1.0, 1.0} | rewards_of(play)),
+        reward_classes=reward_classes({-1.0, 1.0} | rewards_of(play())),
         statistics=(("seat", ()),),
         package=distribution(env.unwrapped),
         two_player=True,

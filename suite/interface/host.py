@@ -9,6 +9,7 @@ engine and replaying the actions. So results depend on the state alone, as long 
 from __future__ import annotations
 
 import collections
+import itertools
 import math
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -26,6 +27,7 @@ from suite.runtime.errors import RunError, UserError
 LIMIT = 1000  # steps of an episode where an engine names no limit of its own
 FEW_REWARDS, MANY_INTEGERS = 3, 16  # up to so many rewards are their own classes; more share evenly spaced ones
 GAPS = 10
+LOOK = 100  # steps of which it is seen whether an engine does the same again
 MIN_ENGINES, ENGINES_PER_ENVIRONMENT = 16, 4  # ended episodes and another user's engines may wait beside the live ones
 
 
@@ -273,6 +275,18 @@ def random_play(id: str, engine: HostEngine, num_actions: int, steps: int = 1000
         yield from random_steps(CheckedEngine(id, engine), num_actions, steps)
     except RunError as error:
         raise UserError(str(error)) from error
+
+
+def require_determined(id: str, play: Callable[[], Iterator[HostStep]]) -> None:
+    """Looks whether random play, begun twice, is the same for its first `LOOK` steps.
+
+    Raises:
+      UserError: it is not, so a run of the task `id` could not be resumed.
+    """
+    one, other = (list(itertools.islice(play(), LOOK)) for _ in range(2))
+    pairs = zip(itertools.chain(*one), itertools.chain(*other), strict=True)
+    if not all(np.array_equal(a, b) for a, b in pairs):
+        raise UserError(f"{id} cannot be a task: its seed does not determine it")
 
 
 def rewards_of(play: Iterable[HostStep]) -> set[float]:

@@ -332,7 +332,7 @@ def _select(option: str, words: str, known: Iterable[str]) -> list[str]:
 
 
 def _words(text: str) -> Iterator[str]:
-    """What commas separate; those in brackets belong to an id, as in "openspiel/dots_and_boxes(num_rows=1,num_cols=1)"."""
+    """What commas separate; those in brackets belong to an id, as in "openspiel/mnk(m=3,n=4,k=3)"."""
     word = None
     for part in text.split(","):
         word = part if word is None else f"{word},{part}"
