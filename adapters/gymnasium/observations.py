@@ -58,7 +58,7 @@ def seen(space: spaces.Space, play: Callable[[Encode], Iterable[np.ndarray]]) ->
     if isinstance(space, spaces.Dict) and "image" in space.spaces:
         inner = seen(space["image"], play)
         return Seen(inner.spec, lambda observation: inner.encode(observation["image"]))
-    if isinstance(space, spaces.Discrete) and space.n > MAX_CATEGORIES:
+    if isinstance(space, spaces.Discrete) and int(space.n) > MAX_CATEGORIES:
         return _digits(int(space.n), int(space.start))
     large = isinstance(space, spaces.Box) and (space.dtype == np.uint8 or math.prod(space.shape) > MAX_SYMBOLS)
     if isinstance(space, spaces.Box) and large and len(space.shape) in (2, 3):
@@ -122,8 +122,9 @@ def _edges(shown_N: np.ndarray, low: float, high: float) -> np.ndarray:
     # To six digits: another processor may compute the last ones of what is shown otherwise.
     inner = np.array([float(f"{quantile:.6g}") for quantile in quantiles])
     width = float(inner[-1] - inner[0]) or 1.0
-    outer = np.concatenate([inner[0] - width * BEYOND, inner[-1] + width * BEYOND])
-    return np.unique(np.concatenate([inner, outer[(outer > low) & (outer < high)]]))
+    lower = inner[0] - width * BEYOND
+    edges = np.concatenate([inner, inner[-1] + width * BEYOND, lower[lower > low]])
+    return np.unique(edges[edges < high])
 
 
 def _as_vector(space: spaces.Space) -> tuple[np.ndarray, np.ndarray, Encode]:
@@ -134,7 +135,8 @@ def _as_vector(space: spaces.Space) -> tuple[np.ndarray, np.ndarray, Encode]:
     low: np.ndarray
     high: np.ndarray
     if isinstance(space, spaces.Discrete):
-        low, high = np.array(int(space.start)), np.array(int(space.start + space.n) - 1)
+        low = np.array(int(space.start))
+        high = low + int(space.n) - 1
     elif isinstance(space, spaces.MultiDiscrete):
         low = np.asarray(space.start)
         high = low + np.asarray(space.nvec) - 1

@@ -26,10 +26,6 @@ if TYPE_CHECKING:
     from suite.interface.host import HostStep
 
 MAX_COMBINATIONS = 256
-DISCRETE = (
-    f"not Discrete with two or more, nor MultiDiscrete or MultiBinary with up to {MAX_COMBINATIONS} combinations "
-    "(gymnasium.wrappers has DiscretizeAction)"
-)
 # Packages whose environments need not be asked for as "module:id".
 HOMES = {"MiniGrid-": "minigrid", "BabyAI-": "minigrid"}
 # Rewards that random steps hardly find: MiniGrid pays 1 - 0.9 x (steps taken / steps allowed) at the goal.
@@ -162,10 +158,16 @@ def _actions(id: str, space: spaces.Space) -> tuple[int, Callable[[int], Any]]:
     elif isinstance(space, spaces.MultiBinary):
         choices = np.full(space.shape, 2)
     else:
-        raise _unsupported(id, f"its actions are {type(space).__name__}, {DISCRETE}")
+        kind = type(space).__name__
+        hint = " (gymnasium.wrappers has DiscretizeAction)" if isinstance(space, spaces.Box) else ""
+        raise _unsupported(id, f"its actions are {kind}, not Discrete, MultiDiscrete or MultiBinary{hint}")
     count = math.prod(choices.ravel().tolist())
-    if count < 2 or (choices.size > 1 and count > MAX_COMBINATIONS):
-        raise _unsupported(id, f"its actions have {count:,} combinations, {DISCRETE}")
+    if count < 2:
+        raise _unsupported(id, "it has fewer than two actions")
+    if choices.size > 1 and count > MAX_COMBINATIONS:
+        raise _unsupported(
+            id, f"its actions have {count:,} combinations, and at most {MAX_COMBINATIONS} become actions"
+        )
 
     def native(action: int) -> Any:
         if isinstance(space, spaces.Discrete):

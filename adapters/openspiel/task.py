@@ -16,7 +16,7 @@ import os
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -29,13 +29,12 @@ from flax import struct
 from adapters.openspiel import host
 from adapters.openspiel import tables as game_tables
 from adapters.openspiel.host import MAX_REWARD_CLASSES, SIGNS
+from adapters.openspiel.library import canonical_name, load, not_played
 from adapters.openspiel.tables import Tables
 from suite.interface.environment import Environment, EnvironmentSpec, ObservationSpec, TimeStep
 from suite.interface.turns import Turn
 from suite.runtime.cache import cache_dir
-from suite.runtime.errors import UserError, did_you_mean
-
-GAMES = {"tic_tac_toe": "tic_tac_toe", "leduc": "leduc_poker", "bargaining": "bargaining"}
+from suite.runtime.errors import UserError
 
 Progress = Callable[[str, float], None]
 
@@ -113,7 +112,7 @@ def make(name: str, progress: Progress | None = None) -> Environment:
     name = canonical_name(name)
     tables = _walked(name, progress)
     spec = SPECS.get(name) or _specified(name, tables)
-    return host.make(_engine(name), spec) if tables is None else TableGame(spec, tables)
+    return host.make(load(name), spec) if tables is None else TableGame(spec, tables)
 
 
 def walked(name: str, progress: Progress | None = None) -> Tables:
@@ -141,7 +140,7 @@ def _walked(name: str, progress: Progress | None) -> Tables | None:
     too_large = path.with_name(f"{path.stem}.too_large")  # an empty file
     tables = read_tables(path)
     if tables is None and not too_large.exists():
-        game = _engine(name)
+        game = load(name)
         key = game_tables.last_offer if name == "bargaining" else None
         try:
             tables = game_tables.build(game, key, report)
@@ -285,11 +284,6 @@ def _entry(table: jax.Array, index: Any, otherwise: int) -> jax.Array:
     return table.at[index].get(mode="fill", fill_value=otherwise, wrap_negative_indices=False)
 
 
-def canonical_name(name: str) -> str:
-    """The name in `GAMES` of a game that is there, else the library's."""
-    return {game: short for short, game in GAMES.items()}.get(name, name)
-
-
 def _specified(name: str, tables: Tables | None) -> EnvironmentSpec:
     """The specification that a game's tables imply, or random play where there are none."""
     return measured(name, tables) if tables else measured_by_play(name)
@@ -298,7 +292,7 @@ def _specified(name: str, tables: Tables | None) -> EnvironmentSpec:
 def measured(name: str, tables: Tables) -> EnvironmentSpec:
     """What a game's tables say that it is."""
     levels = tuple(float(level) for level in np.union1d(tables.return_2N[:, tables.num_open :], [0.0]))
-    game = _engine(name)
+    game = load(name)
     return _specification(
         name,
         symbols=tables.observation_2NO.shape[-1],
@@ -315,7 +309,7 @@ def measured(name: str, tables: Tables) -> EnvironmentSpec:
 @functools.lru_cache(maxsize=16)
 def measured_by_play(name: str) -> EnvironmentSpec:
     """What random play says that a game is."""
-    game = _engine(name)
+    game = load(name)
     symbols = int(np.prod(game.observation_tensor_shape()))
     actions, outcomes = game.num_distinct_actions(), game.max_chance_outcomes()
     known = _specification(
@@ -342,72 +336,7 @@ def _fully_observed(game: Any) -> bool:
 
 
 def _not_categorical(name: str) -> UserError:
-    return _not_played(name, "its observations are not whole numbers from 0 to 255")
-
-
-def _engine(name: str) -> Any:
-    """The `pyspiel.Game`, or a `UserError` that says why it is none for us."""
-    import pyspiel
-
-    kinds = {kind.short_name: kind for kind in pyspiel.registered_games()}
-    short, bracket, parameters = name.partition("(")
-    identifier = GAMES.get(short, short)
-    if identifier not in kinds:
-        playable = {id for id, kind in kinds.items() if kind.default_loadable and not _obstacle(kind)}
-        raise UserError(f"unknown game openspiel/{name}: {did_you_mean(short, {*GAMES, *playable})}")
-    kind = kinds[identifier]
-    if not (bracket or kind.default_loadable):
-        first = next(iter(kind.parameter_specification))
-        needed = "game=tic_tac_toe()" if "game" in kind.parameter_specification else f"{first}=..."
-        raise _not_played(name, f"it needs parameters, as in {identifier}({needed})")
-    try:
-        with _silent_stderr():
-            game = pyspiel.load_game(identifier + bracket + parameters)
-    except pyspiel.SpielError as error:
-        raise _not_played(name, " ".join(str(error).split())) from error
-    kind, players = game.get_type(), game.num_players()
-    if players != 2:
-        more = f"; {identifier}(players=2) has" if "players" in kind.parameter_specification else ""
-        raise _not_played(name, f"it has {players} player{'s' if players > 1 else ''}, not two{more}")
-    if kind.dynamics == pyspiel.GameType.Dynamics.SIMULTANEOUS:
-        in_turns = f"openspiel/turn_based_simultaneous_game(game={identifier}{bracket}{parameters or '()'})"
-        raise _not_played(name, f"its players move simultaneously; in {in_turns} they take turns")
-    obstacle = _obstacle(kind)
-    if obstacle:
-        raise _not_played(name, obstacle)
-    return game
-
-
-def _obstacle(kind: Any) -> str:
-    """Why games of this type, whatever their parameters, cannot be played here; "" if they can."""
-    import pyspiel
-
-    if not kind.min_num_players <= 2 <= kind.max_num_players:
-        return "it is not for two players"
-    if kind.dynamics != pyspiel.GameType.Dynamics.SEQUENTIAL:
-        return "its players do not take turns"
-    if not kind.provides_observation_tensor:
-        return "the library gives no observation tensor for it"
-    if kind.chance_mode == pyspiel.GameType.ChanceMode.SAMPLED_STOCHASTIC:
-        return "it does not tell the probabilities of its chance events"
-    return ""
-
-
-def _not_played(name: str, reason: str) -> UserError:
-    return UserError(f"openspiel/{name} cannot be played here: {reason}")
-
-
-@contextlib.contextmanager
-def _silent_stderr() -> Iterator[None]:
-    """The library writes there what it raises besides."""
-    kept = os.dup(2)
-    with open(os.devnull, "wb") as nothing:
-        os.dup2(nothing.fileno(), 2)
-    try:
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+    return not_played(name, "its observations are not whole numbers from 0 to 255")
 
 
 def read_tables(path: Path) -> Tables | None:

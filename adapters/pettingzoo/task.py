@@ -45,6 +45,7 @@ class PettingZooEngine:
 
     def reset(self, seed: int) -> HostStep:
         self.env.reset(seed=seed)
+        self._parts: dict[str, dict[str, Any]] = {}
         self._seen: dict[str, np.ndarray] = {}
         return self._show(np.zeros(2, np.float32))
 
@@ -53,6 +54,7 @@ class PettingZooEngine:
         env.step(self._first_action + action)
         rewards = np.array([env.rewards.get(agent, 0.0) for agent in env.possible_agents], np.float32)
         while not self._over() and self._dead(env.agent_selection):
+            self._look()
             env.step(None)
         return self._show(rewards)
 
@@ -62,16 +64,19 @@ class PettingZooEngine:
     def _over(self) -> bool:
         return all(map(self._dead, self.env.agents))
 
+    def _look(self) -> None:
+        for agent, encode in zip(self.env.possible_agents, self._encoders, strict=True):
+            if agent in self.env.agents:
+                self._parts[agent] = _parts(self.env.observe(agent))
+                self._seen[agent] = encode(self._parts[agent]["observation"])
+
     def _show(self, rewards: np.ndarray) -> HostStep:
         from suite.interface.host import HostStep
 
         env, actor, over = self.env, self.env.agent_selection, self._over()
-        shown = {agent: env.observe(agent) for agent in env.agents}
-        for agent, encode in zip(env.possible_agents, self._encoders, strict=True):
-            if agent in shown:
-                self._seen[agent] = encode(_parts(shown[agent])["observation"])
-        parts = env.infos.get(actor, {}) | (_parts(shown[actor]) if actor in shown else {})
-        legal_A = np.ones(env.action_space(actor).n, bool) & np.asarray(parts.get("action_mask", True), bool)
+        self._look()
+        mask = (env.infos.get(actor, {}) | self._parts[actor]).get("action_mask", True)
+        legal_A = np.ones(env.action_space(actor).n, bool) & np.asarray(mask, bool)
         if not (over or legal_A.any()):
             raise RunError(f"{actor} has no legal action")
         terminated = over and any(env.terminations.values())
@@ -86,7 +91,7 @@ class PettingZooEngine:
         )
 
 
-def _parts(observed: Any) -> Any:
+def _parts(observed: Any) -> dict[str, Any]:
     """An observation, or a space of them, by parts: "observation" and, if there is one, "action_mask"."""
     parts = observed.spaces if isinstance(observed, spaces.Dict) else observed
     return parts if isinstance(parts, dict) and "observation" in parts else {"observation": observed}

@@ -298,13 +298,17 @@ def reward_classes(rewards: Iterable[float]) -> tuple[float, ...]:
     """`EnvironmentSpec.reward_classes` for rewards that are known to occur.
 
     The rewards themselves and 0, if that makes at most 3, or at most 16 integers; at least 0 and 1. Else some ten
-    evenly spaced levels, one of them 0, over the range of the rewards with its ends at integers.
+    evenly spaced levels, one of them 0, over the range of the rewards with its ends at integers. Of rewards that are
+    all below 0.1 the same, as if they were so many powers of ten larger that one is not.
     """
-    levels = {0.0} | {round(reward, 6) for reward in rewards}
+    known = {0.0, *rewards}
+    most = max(map(abs, known))
+    scale = 10 ** max(0, -math.ceil(math.log10(most))) if most else 1
+    levels = {round(scale * reward, 6) for reward in known}
     integers = all(level.is_integer() for level in levels)
     if len(levels) > (MANY_INTEGERS if integers else FEW_REWARDS):
         low, high = math.floor(min(levels)), math.ceil(max(levels))
         gap = (high - low) / GAPS
         first, last = math.floor(round(low / gap, 6)), math.ceil(round(high / gap, 6))
         levels = {round(gap * n, 6) for n in range(first, last + 1)}
-    return tuple(sorted(levels if len(levels) > 1 else {0.0, 1.0}))
+    return tuple(sorted(level / scale for level in levels) if len(levels) > 1 else (0.0, 1.0))

@@ -122,8 +122,10 @@ def test_no_step_after_the_end():
         ([0.25, 1], (0, 0.25, 1)),
         ([0.1, 0.3, 0.7, 0.9], (0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1)),
         ([-1, 0.1, 0.3, 0.7], (-1, -0.8, -0.6, -0.4, -0.2, 0, 0.2, 0.4, 0.6, 0.8, 1)),
+        ([1e-7, 3e-7], (0, 1e-7, 3e-7)),
+        ([0.01, 0.03, 0.07, 0.0925], (0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08, 0.09, 0.1)),
         (range(-10, 10), tuple(round(1.9 * n, 6) for n in range(-6, 6))),
     ],
 )
 def test_reward_classes(rewards, classes):
-    assert reward_classes(map(float, rewards)) == classes
+    assert reward_classes(map(float, rewards)) == pytest.approx(classes, rel=1e-12)

@@ -129,6 +129,13 @@ def test_patterns_and_ids_give_each_run_once():
     assert runs[1].config.ppo.clip == 0.3
 
 
+def test_commas_in_brackets_belong_to_an_id():
+    games = ["openspiel/mnk(m=3,n=3,k=2)", "openspiel/start_at(game=mnk(m=2,n=2),history=0)", "x(", "y"]
+    assert list(sweep._words(",".join(games[:2]))) == games[:2]
+    assert list(sweep._words(",".join(games))) == [*games[:2], "x(,y"]
+    assert list(sweep._words("a,,b,")) == ["a", "", "b", ""]
+
+
 def test_the_table_fits_the_terminal():
     runs = plan("minatar/breakout", "random", range(30), "smoke")
     runs[0].end(Outcome("finished", result={"steps": 64, "seconds": 90.0, "scores": {"return": None}}))

@@ -19,7 +19,7 @@ from suite import registry
 from suite.interface.batching import Batched
 from suite.interface.environment import EnvironmentSpec, ObservationSpec, TimeStep
 from suite.runtime.errors import UserError
-from tests.documents import code
+from tests.documents import REPOSITORY, code
 from tests.tiny import CORRIDOR, Corridor, Pennies
 
 EXPORTED = sorted(id for id, task in registry.tasks().items() if task.family not in gymnasium_export.NOT_EXPORTED)
@@ -185,6 +185,20 @@ def test_vector_wrappers_count_episodes(corridor):
     for _ in range(20):
         envs.step(np.ones(3, int))
     assert list(envs.return_queue) == [1.0] * len(envs.return_queue) and envs.episode_count >= 15
+
+
+def test_processes_that_are_forked_work_or_say_at_once_what_would():
+    """`AsyncVectorEnv` forks unless it is told otherwise, and JAX hangs in a fork of a process that used it."""
+    code = (
+        "import gymnasium, jax, numpy as np; from adapters.gymnasium.export import SuiteEnv; from tests.tiny import *\n"
+        "def vector(): return gymnasium.vector.AsyncVectorEnv([lambda: SuiteEnv(Corridor())] * 2, context='fork')\n"
+        "envs = vector(); envs.reset(seed=0); print(len(envs.step([1, 1])[1])); envs.close(); jax.numpy.zeros(1)\n"
+        "try: vector().reset(seed=0)\n"
+        "except Exception as error: print(type(error).__name__, error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY, timeout=120)
+    works, refused = done.stdout.splitlines()
+    assert works == "2" and refused.startswith("UserError JAX was used before") and 'context="spawn"' in refused
 
 
 def test_symbols_are_multi_discrete():

@@ -14,6 +14,7 @@ import pytest
 from adapters.openspiel import host as openspiel_host
 from adapters.openspiel import tables as game_tables
 from adapters.openspiel import task as openspiel
+from adapters.openspiel.library import GAMES
 from suite import registry
 from suite.interface.host import HostEnvironment
 from suite.runs import training
@@ -27,7 +28,7 @@ SMALL = ["tic_tac_toe", "leduc", "kuhn_poker"]
 
 
 def engine(name):
-    return pyspiel.load_game(openspiel.GAMES.get(name, name))
+    return pyspiel.load_game(GAMES.get(name, name))
 
 
 @functools.cache

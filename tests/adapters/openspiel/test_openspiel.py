@@ -7,6 +7,7 @@ import importlib.metadata
 import subprocess
 import sys
 from types import SimpleNamespace
+from unittest.mock import ANY
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ import pytest
 
 from adapters.openspiel import tables as game_tables
 from adapters.openspiel import task as openspiel
+from adapters.openspiel.library import GAMES
 from suite.runtime.errors import UserError
 from tests import games
 from tests.contract import check_environment
@@ -25,7 +27,7 @@ SIZES = {"tic_tac_toe": 5478, "leduc": 9457, "bargaining": 412_712, "kuhn_poker"
 
 
 def engine(name):
-    return pyspiel.load_game(openspiel.GAMES.get(name, name))
+    return pyspiel.load_game(GAMES.get(name, name))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -45,8 +47,8 @@ def test_the_specification_is_the_engines(name):
             measured, reward_classes=(-1.0, 0.0, 1.0), ranges=(*others, ("return", -1.0, 1.0))
         )
     assert spec == measured
-    if name in openspiel.GAMES:
-        assert openspiel.spec(name) is openspiel.spec(openspiel.GAMES[name]) is spec
+    if name in GAMES:
+        assert openspiel.spec(name) is openspiel.spec(GAMES[name]) is spec
 
 
 @pytest.mark.parametrize(
@@ -268,22 +270,50 @@ def assert_equal(one, other):
     [
         ("tic_tac_to", "unknown game openspiel/tic_tac_to: did you mean 'tic_tac_toe'?"),
         ("leduk", "unknown game openspiel/leduk: did you mean 'leduc'?"),
-        ("matrix_rps", "its players move simultaneously; only games in which they take turns can be"),
+        (
+            "matrix_rps",
+            "its players move simultaneously; "
+            "in openspiel/turn_based_simultaneous_game(game=matrix_rps()) they take turns",
+        ),
         ("mfg_garnet", "it has 1 player, not two"),
         ("hearts", "it has 4 players, not two"),
         ("oware", "its observations are not whole numbers from 0 to 255"),
         ("sheriff", "the library gives no observation tensor for it"),
         ("negotiation", "it does not tell the probabilities of its chance events"),
-        ("misere", "it is made of another game, which an id cannot name"),
+        ("misere", "it needs parameters, as in misere(game=tic_tac_toe())"),
+        ("efg_game", "it needs parameters, as in efg_game(filename=...)"),
+        ("crazy_eights", "it has 5 players, not two; crazy_eights(players=2) has"),
+        ("kuhn_poker(players=99)", ANY),
         ("chess", "its observations are not whole numbers from 0 to 255"),  # too large to be walked
     ],
 )
 @pytest.mark.parametrize("function", [openspiel.spec, openspiel.make])
-def test_other_games_are_refused_in_one_line(function, name, line, tmp_path, monkeypatch):
+def test_other_games_are_refused_in_one_line(function, name, line, tmp_path, monkeypatch, capfd):
     monkeypatch.setenv("SUITE_CACHE_DIR", str(tmp_path))
     with pytest.raises(UserError) as error:
         function(name)
-    assert str(error.value) in (line, f"openspiel/{name} cannot be played here: {line}")
+    said = str(error.value)
+    assert said == line or said.removeprefix(f"openspiel/{name} cannot be played here: ") == line
+    assert "\n" not in said and capfd.readouterr().err == ""
+
+
+def test_an_unknown_game_suggests_none_that_is_far_off_or_cannot_be_played():
+    with pytest.raises(UserError, match="valid: ") as error:
+        openspiel.spec("no_such_game")
+    valid = str(error.value).partition("valid: ")[2].split(", ")
+    assert "leduc" in valid and not {"coin_game", "hearts", "matrix_rps", "misere"} & set(valid)
+    for word, near in (("connect4", "connect_four"), ("kuhn", "kuhn_poker"), ("kuhn_pokr(players=2)", "kuhn_poker")):
+        with pytest.raises(UserError, match=f"did you mean '{near}'"):
+            openspiel.spec(word)
+
+
+def test_parameters_are_the_librarys(tmp_path, monkeypatch):
+    monkeypatch.setenv("SUITE_CACHE_DIR", str(tmp_path))
+    assert_equal(openspiel.walked("kuhn_poker(players=2)"), games.walked("kuhn_poker"))
+    assert openspiel.spec("kuhn_poker(players=2)").id == "openspiel/kuhn_poker(players=2)"
+    wide, square = openspiel.make("mnk(m=3,n=2,k=2)"), openspiel.make("mnk(m=2,n=2,k=2)")  # each has a file of its own
+    assert (wide.spec.num_actions, square.spec.num_actions) == (6, 4)
+    assert openspiel.spec("leduc(suit_isomorphism=true)").observation.shape < openspiel.spec("leduc").observation.shape
 
 
 def test_making_reports_progress(tmp_path, monkeypatch):
@@ -298,7 +328,8 @@ def test_making_reports_progress(tmp_path, monkeypatch):
 
 def test_the_specification_loads_no_engine():
     code = (
-        "import sys; from adapters.openspiel.task import GAMES, spec; specs = [spec(name) for name in GAMES];"
+        "import sys; from adapters.openspiel.library import GAMES; from adapters.openspiel.task import spec;"
+        "specs = [spec(name) for name in GAMES];"
         "sys.exit('pyspiel' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pettingzoo
 import pytest
-from gymnasium import spaces
 
 from adapters.pettingzoo import export
 from adapters.pettingzoo import task as import_
@@ -14,6 +12,7 @@ from suite import registry
 from suite.interface.batching import Batched
 from suite.interface.turns import choose_event
 from suite.runtime.errors import UserError
+from tests.adapters.foreign import Game
 from tests.adapters.pettingzoo.standard import check
 from tests.contract import check_environment
 from tests.tiny import Corridor, Pennies
@@ -176,59 +175,13 @@ def test_imported_equals_the_engine():
     assert ends >= 6
 
 
-class Foreign(pettingzoo.AECEnv):
-    """With any spaces; not to be played."""
-
-    def __init__(self, observation, actions, agents=2):
-        self.possible_agents = [f"agent_{n}" for n in range(agents)]
-        self.observation_space = lambda agent: observation
-        self.action_space = lambda agent: actions
-
-
-def masked(observation):
-    return spaces.Dict({"observation": observation, "action_mask": spaces.MultiBinary(2)})
-
-
-BITS = masked(spaces.MultiBinary(4))
-
-
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        ((BITS, spaces.Discrete(2), 3), "it has 3 agents, not two"),
-        ((BITS, spaces.Box(0, 1)), "its actions are not Discrete"),
-        ((BITS, spaces.Discrete(1)), "its actions are not Discrete with two or more"),
-        ((spaces.MultiBinary(4), spaces.Discrete(2)), "its observations have no action mask"),
-        ((masked(spaces.Box(0, 1)), spaces.Discrete(2)), "its observations are not integers from 0 to at most 255"),
-        ((masked(spaces.Discrete(257)), spaces.Discrete(2)), "its observations are not integers from 0 to at most 255"),
-    ],
-)
-def test_unsupported(monkeypatch, args, message):
-    spec = pettingzoo.EnvSpec("tests/foreign_v0", lambda: Foreign(*args))
-    monkeypatch.setitem(pettingzoo.aec_registry, spec.id, spec)
-    with pytest.raises(UserError) as error:
-        import_.make("tests/foreign_v0")
-    assert str(error.value).startswith(f"pettingzoo/tests/foreign_v0 cannot be a task: {message}")
-
-
-@pytest.mark.parametrize(
-    ("id", "message"),
-    [
-        ("connect_five_v3", "PettingZoo has no 'connect_five_v3'; did you mean 'classic/connect_four-v3'?"),
-        ("rps_v2", "pettingzoo/rps_v2 cannot be a task: its observations have no action mask"),
-    ],
-)
-def test_unsupported_games(id, message):
-    for ask in (import_.spec, import_.make):
-        with pytest.raises(UserError) as error:
-            ask(id)
-        assert str(error.value) == message
-
-
-def test_a_missing_dependency_is_one_error(monkeypatch):
-    def missing():
-        raise gymnasium.error.DependencyNotInstalled("needs\n  another package")
-
-    monkeypatch.setitem(pettingzoo.aec_registry, "tests/foreign-v0", pettingzoo.EnvSpec("tests/foreign_v0", missing))
-    with pytest.raises(UserError, match=r"^pettingzoo/tests.foreign_v0: needs another package$"):
-        import_.spec("tests.foreign_v0")
+def test_a_game_goes_on_as_long_as_one_agent_lives():
+    engine = import_.PettingZooEngine(Game(lives=(2, 4)), [lambda number: np.array([number], np.uint8)] * 2)
+    shown = [engine.reset(0), *(engine.step(1) for _ in range(6))]
+    assert [step.player for step in shown] == [1, 2, 1, 2, 2, 2, 2]
+    assert [step.observation.ravel().tolist() for step in shown] == [
+        *([0, 0], [1, 0], [1, 1], [2, 1], [2, 2], [2, 3], [2, 4])  # the dead one sees what it saw last
+    ]
+    assert [step.reward.tolist() for step in shown] == [[0, 0], [0, 0], [0, 0], [1, 0], [0, 0], [0, 0], [0, 1]]
+    assert [step.terminated for step in shown] == 6 * [False] + [True]
+    assert shown[5].legal_A.all() and not shown[6].legal_A.any()
