@@ -58,7 +58,9 @@ class GymnasiumEngine:
     def _show(self, observation: Any, reward: Any, terminated: bool, truncated: bool) -> HostStep:
         from suite.interface.host import HostStep
 
-        return HostStep(self._encode(observation), np.float32(reward), terminated, truncated and not terminated)
+        with np.errstate(over="ignore"):  # what overflows is refused by who asks
+            paid = np.float32(reward)
+        return HostStep(self._encode(observation), paid, terminated, truncated and not terminated)
 
 
 def spec(id: str) -> EnvironmentSpec:

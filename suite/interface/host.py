@@ -95,7 +95,7 @@ class CheckedEngine:
         except Exception as error:  # whatever somebody else's code raises
             raise RunError(f"{where}: {type(error).__name__}: {' '.join(str(error).split())}") from error
         if not np.isfinite(host_step.reward).all():
-            raise RunError(f"{where}: the reward is {host_step.reward}, not a finite float32")
+            raise RunError(f"{where}: the reward is {np.asarray(host_step.reward).tolist()}, not a finite float32")
         return host_step
 
 
