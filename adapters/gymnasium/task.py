@@ -121,16 +121,16 @@ def _imported(id: str) -> GymnasiumTask:
         raise _unsupported(id, f"its observations are {error}") from error
     require_determined(f"gymnasium/{id}", lambda: play(seen.encode))
     package = distribution(env.unwrapped)
-    limit = env.spec.max_episode_steps or getattr(env.unwrapped, "max_steps", None) or LIMIT
-    table = getattr(env.unwrapped, "P", None)
-    paid = rewards_of(play(seen.encode))
+    longest = env.spec.max_episode_steps or getattr(env.unwrapped, "max_steps", None)
+    paid = rewards_of(play(seen.encode)) | PAYS.get(package, set())
     task = EnvironmentSpec(
         id=f"gymnasium/{id}",
         observation=seen.spec,
         num_actions=count,
-        reward_classes=reward_classes(_paid(table) if table else paid | PAYS.get(package, set())),
+        reward_classes=reward_classes(_paid(getattr(env.unwrapped, "P", None)) or paid),
         package=package,
     )
+    limit = longest if isinstance(longest, int) else LIMIT
     env.close()
     return GymnasiumTask(task, lambda: GymnasiumEngine(_make(id), seen.encode, native), limit)
 
@@ -181,8 +181,14 @@ def _actions(id: str, space: spaces.Space) -> tuple[int, Callable[[int], Any]]:
 
 
 def _paid(table: Any) -> set[float]:
-    """The rewards in a toy text's transition table: state, action, then (probability, next state, reward, end)."""
-    return {float(reward) for moves in table.values() for ends in moves.values() for _, _, reward, _ in ends}
+    """The rewards in a toy text's transition table: state, action, then (probability, next state, reward, end).
+
+    None of anything else: other environments may call something of theirs P.
+    """
+    try:
+        return {float(reward) for moves in table.values() for ends in moves.values() for _, _, reward, _ in ends}
+    except (AttributeError, TypeError, ValueError):
+        return set()
 
 
 def distribution(engine: Any) -> str:

@@ -20,6 +20,7 @@ class Env(gymnasium.Env):
       shows: what it shows instead, of the time.
       seeded: whether `reset` heeds its seed.
       raises: "reset" or "step", which fails.
+      own: attributes.
     """
 
     def __init__(
@@ -31,9 +32,11 @@ class Env(gymnasium.Env):
         shows=None,
         seeded=True,
         raises="",
+        own=(),
     ):
         self.observation_space, self.action_space = copy.deepcopy(observation), actions
         self.pay, self.length, self.shows, self.seeded, self.raises = pay, length, shows, seeded, raises
+        vars(self).update(own)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

@@ -8,13 +8,17 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import itertools
+import json
+import math
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pettingzoo
 import pytest
 from gymnasium import spaces
@@ -141,6 +145,7 @@ CASES = [
     gym("ends with the first step", length=1),
     gym("is only cut off, by a time limit", options={"max_episode_steps": 7}),
     gym("never ends"),
+    gym("means something else by P and max_steps", own={"P": np.eye(2), "max_steps": math.inf}),
     gym("does not heed its seed", "its seed does not determine it", observation=spaces.Discrete(200), seeded=False),
     gym(
         "says that its seed does not determine it", "its seed does not determine it", options={"nondeterministic": True}
@@ -253,6 +258,16 @@ def test_case(case, capsys):
         assert became.startswith("stops: " if case.stops else "trains: ")
     assert (case.refused or case.stops) in became
     assert f"| {case.what} | `{case.id}` | {became} |" in (REPOSITORY / DOCUMENT).read_text().splitlines()
+
+
+def test_cartpole_is_trained_and_evaluated(tmp_path, capsys):
+    """Whole runs of others are as those of our own tasks: they differ in the specification alone."""
+    words = ["run", "gymnasium/CartPole-v1", "--agent", "mfrl", "--preset", "smoke", "--out", str(tmp_path)]
+    assert cli.main([*words, "--quiet", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert result["status"] == "finished" and result["scores"]["episodes"] > 0
+    evaluations = pd.read_csv(Path(result["folder"]) / "evaluations.csv")
+    assert len(evaluations) >= 4 and (evaluations["return"] == evaluations["length"]).all()  # 1 for every step
 
 
 def test_the_table_has_these_cases_and_no_others():
