@@ -71,8 +71,8 @@ def spec(id: str) -> EnvironmentSpec:
         imported (not needed for MiniGrid's).
 
     Reward classes are the rewards in an environment's own transition table (Gymnasium's toy texts), else those of
-    1,000 random steps; see `suite.interface.host.reward_classes`. `adapters.gymnasium.observations.seen` says what is
-    seen. The same random steps are played for everyone: neither depends on a run.
+    1,000 random steps; see `suite.interface.random_play.reward_classes`. `adapters.gymnasium.observations.seen` says
+    what is seen. The same random steps are played for everyone: neither depends on a run.
 
     Raises:
       UserError: no such environment, or one that cannot be a task, and why.
@@ -104,7 +104,8 @@ def make(id: str, progress: Callable[[str, float], None] | None = None) -> Envir
 @functools.lru_cache(maxsize=16)
 def _imported(id: str) -> GymnasiumTask:
     from suite.interface.environment import EnvironmentSpec
-    from suite.interface.host import LIMIT, random_play, require_determined, reward_classes, rewards_of
+    from suite.interface.host import LIMIT
+    from suite.interface.random_play import random_play, require_determined, reward_classes, rewards_of
 
     env = _make(id)
     count, native = _actions(id, env.action_space)

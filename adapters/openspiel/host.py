@@ -13,7 +13,8 @@ import numpy as np
 
 from adapters.openspiel.tables import MAX_SYMBOL, NotCategoricalError
 from suite.interface.environment import EnvironmentSpec
-from suite.interface.host import HostEnvironment, HostStep, random_steps
+from suite.interface.host import HostEnvironment, HostStep
+from suite.interface.random_play import random_steps
 from suite.runtime.errors import RunError
 
 SIGNS = (-1.0, 0.0, 1.0)

@@ -102,7 +102,7 @@ def spec(id: str) -> EnvironmentSpec:
 
     The first agent is player 1, the second player 2. Observations are flattened to symbols. There is no chance player:
     what an engine draws itself comes from its seed and cannot be told apart from its rules. Reward classes are -1, 0, 1
-    and the rewards of 1,000 random steps; see `suite.interface.host.reward_classes`.
+    and the rewards of 1,000 random steps; see `suite.interface.random_play.reward_classes`.
 
     Args:
       id: a classic game's "connect_four_v3", or "family/name" (or "family.name") of PettingZoo's registry of AEC
@@ -136,7 +136,7 @@ def make(id: str, progress: Callable[[str, float], None] | None = None) -> Envir
 @functools.lru_cache(maxsize=16)
 def _imported(id: str) -> PettingZooTask:
     from suite.interface.environment import EnvironmentSpec, ObservationSpec
-    from suite.interface.host import random_play, require_determined, reward_classes, rewards_of
+    from suite.interface.random_play import random_play, require_determined, reward_classes, rewards_of
 
     env = _make(id)
     count = len(env.possible_agents)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from suite.interface.batching import Batched
-from suite.interface.host import ENGINES_PER_ENVIRONMENT, MIN_ENGINES, HostEnvironment, HostStep, reward_classes
+from suite.interface.host import ENGINES_PER_ENVIRONMENT, MIN_ENGINES, HostEnvironment, HostStep
+from suite.interface.random_play import reward_classes
 from tests.contract import check_environment
 from tests.tiny import PENNIES_SPEC, Pennies
 from tests.walks import Walks
