@@ -176,11 +176,11 @@ def _image(space: spaces.Box) -> Seen:
         channels, rows, columns = sides
     low, high = float(space.low.min()), float(space.high.max())
     whole = np.dtype(space.dtype).kind in "biu"
-    if channels > MAX_CHANNELS or math.prod(sides) > MAX_VALUES:
-        raise UnseenError(
-            f"{space.shape}, not [height, width] with up to {MAX_CHANNELS} channels, before or behind, and "
-            f"{MAX_VALUES:,} values (gymnasium.wrappers has ResizeObservation)"
-        )
+    if channels > MAX_CHANNELS:
+        raise UnseenError(f"{space.shape}, not [height, width] with up to {MAX_CHANNELS} channels before or behind")
+    if math.prod(sides) > MAX_VALUES:
+        hint = "gymnasium.wrappers has ResizeObservation"
+        raise UnseenError(f"{space.shape}, more than the {MAX_VALUES:,} values that an image may have ({hint})")
     if not (0 <= low < high <= 255 if whole else -math.inf < low < high < math.inf):
         raise UnseenError(
             f"{space.shape} from {low:g} to {high:g}, not an image of 0 to at most 255, or floats in bounds"

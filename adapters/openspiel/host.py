@@ -76,7 +76,7 @@ class OpenSpielEngine:
         high = self._spec.observation.high
         wrong = exact[(exact != exact.round()) | (exact < 0) | (exact > high)]
         if wrong.size:
-            raise RunError(f"{self._spec.id}: an observation holds {wrong[0]:g}, not a whole number from 0 to {high}")
+            raise RunError(f"an observation holds {wrong[0]:g}, not a whole number from 0 to {high}")
         return exact.astype(np.uint8)
 
 
