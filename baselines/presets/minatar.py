@@ -64,9 +64,8 @@ MINATAR_SMALL: dict[str, Any] = {
 # meets one (two of three seeds ended at 1). This is the paper's rate.
 FREEWAY_SMALL: dict[str, Any] = {"ppo.learning_rate": 4.5e-4}
 
-# Twice the steps of `small`, and dreams of twice its length. At `small`'s learning rate a policy loses again what it has
-# learned, if the rate stays what it is: mfrl, which always anneals it, would have half the return on Breakout. So all
-# agents anneal it.
+# Twice the steps of `small`, and dreams of twice its length. A policy whose learning rate stays what it is loses again
+# what it has learned: mfrl, which always anneals it, would have half the return on Breakout. So all agents anneal it.
 MINATAR_MEDIUM: dict[str, Any] = MINATAR_SMALL | {
     "protocol.steps": 204_800,
     "imagination.horizon": 12,
