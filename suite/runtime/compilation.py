@@ -7,6 +7,7 @@ import hashlib
 import logging
 import os
 import platform
+import sys
 import threading
 from collections.abc import Iterable
 from pathlib import Path
@@ -22,15 +23,20 @@ if TYPE_CHECKING:
 # policy update came five seconds later on two cores.
 AT_ONCE = 1
 
-OTHER_ARITHMETIC = (
-    "JAX_ENABLE_X64",
-    "JAX_DEFAULT_DTYPE_BITS",
-    "JAX_DEFAULT_PRNG_IMPL",
-    "JAX_DISABLE_JIT",
-    "JAX_DEBUG_NANS",
-    "JAX_DEBUG_INFS",
-)
-OFF = ("", "0", "false", "f", "no", "n", "off")
+TRANSFERS = ("", "_HOST_TO_DEVICE", "_DEVICE_TO_DEVICE", "_DEVICE_TO_HOST")
+
+OFF = ("", "none", "0", "false", "f", "no", "n", "off")
+# Switches of JAX's that change what is computed, or that the compiled phases do not survive, and what they may be.
+ARITHMETIC: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("JAX_ENABLE_X64", "JAX_DISABLE_JIT", "JAX_NO_EXECUTION", "JAX_NO_TRACING"), OFF),
+    **dict.fromkeys(("JAX_DEBUG_NANS", "JAX_DEBUG_INFS", "JAX_DEBUG_KEY_REUSE", "JAX_HIGH_DYNAMIC_RANGE_GUMBEL"), OFF),
+    **dict.fromkeys((f"JAX_TRANSFER_GUARD{way}" for way in TRANSFERS), ("", "none", "allow", "log")),
+    "JAX_DEFAULT_DTYPE_BITS": ("", "64"),
+    "JAX_DEFAULT_MATMUL_PRECISION": ("", "none", "default", "high", "highest", "float32"),  # or more than that
+    "JAX_DEFAULT_PRNG_IMPL": ("", "threefry2x32"),
+    "JAX_RANDOM_SEED_OFFSET": ("", "0"),
+    "JAX_THREEFRY_PARTITIONABLE": ("", "1", "true", "t", "yes", "y", "on"),
+}
 CPU_INFO = Path("/proc/cpuinfo")
 
 
@@ -48,14 +54,16 @@ def refuse_other_arithmetic() -> None:
     """Looks for switches of JAX's that change what is computed, or that its compiled phases do not survive.
 
     Raises:
-      UserError: one is set in the environment.
+      UserError: one is set in the environment, or by a program that has imported JAX.
     """
-    for name in OTHER_ARITHMETIC:
-        value = os.environ.get(name, "")
-        if value.lower() not in OFF:
+    jax = sys.modules.get("jax")  # not imported for this: a typo does not wait for it
+    for name, allowed in ARITHMETIC.items():
+        if (value := os.environ.get(name, "")).lower() not in allowed:
             raise UserError(
                 f"{name}={value} is set in the environment, and would change results or end the run: unset it"
             )
+        if jax is not None and (held := str(getattr(jax.config, name.lower(), ""))).lower() not in allowed:
+            raise UserError(f"jax.config.{name.lower()} is {held}, which would change results or end the run")
 
 
 def device_kind() -> str:
@@ -69,17 +77,39 @@ def device_kind() -> str:
     try:
         return jax.default_backend()
     except (RuntimeError, AssertionError) as error:  # which one depends on what is wrong
-        asked = os.environ.get("JAX_PLATFORMS", "")
+        variables = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")
+        asked = " and ".join(f"{name}={os.environ[name]}" for name in variables if os.environ.get(name))
         raise UserError(
-            f"JAX finds no device for JAX_PLATFORMS={asked!r}; JAX_PLATFORMS=cpu always works, and without the "
-            "variable JAX takes the fastest device there is"
+            f"JAX finds no device for {asked or jax.config.jax_platforms}; this machine has: "  # type: ignore[attr-defined]
+            f"{', '.join(_platforms())}; without the variable JAX takes the fastest"
         ) from error
 
 
+def _platforms() -> list[str]:
+    """Kinds of devices that JAX finds here if it is not asked for one."""
+    import jax
+    from jax.extend.backend import backends, clear_backends
+
+    asked = {"jax_platforms": jax.config.jax_platforms, "jax_platform_name": os.environ.get("JAX_PLATFORM_NAME", "")}  # type: ignore[attr-defined]
+    try:
+        for name in asked:
+            jax.config.update(name, "")
+        return sorted(backends())
+    finally:
+        for name, value in asked.items():
+            jax.config.update(name, value)
+        clear_backends()
+
+
 def enable_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder (`SUITE_CACHE_DIR`), unless JAX was told of another."""
+    """Keeps compiled programs in the user's cache folder (`SUITE_CACHE_DIR`), unless JAX was told of another.
+
+    Raises:
+      UserError: JAX has nothing to compute on, as `device_kind` says.
+    """
     import jax
 
+    device_kind()
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         jax.config.update("jax_compilation_cache_dir", str(cache_dir() / "xla" / cpu_digest()))
     # Small programs too: reading one takes 6 ms, and compiling it 15 and more.

@@ -348,21 +348,44 @@ def test_the_version(suite):
     assert suite("--version") == (0, f"suite {version('world-model-suite')}\n", "")
 
 
-@pytest.mark.parametrize("variable", ["JAX_ENABLE_X64", "JAX_DEBUG_NANS", "JAX_DISABLE_JIT"])
+SWITCHES = {
+    "JAX_ENABLE_X64": ("1", "False"),
+    "JAX_DEBUG_NANS": ("maybe", "0"),
+    "JAX_DISABLE_JIT": ("on", "off"),
+    "JAX_TRANSFER_GUARD": ("disallow", "allow"),
+    "JAX_THREEFRY_PARTITIONABLE": ("0", "1"),
+    "JAX_RANDOM_SEED_OFFSET": ("7", "0"),
+    "JAX_DEFAULT_PRNG_IMPL": ("rbg", "threefry2x32"),
+    "JAX_DEFAULT_MATMUL_PRECISION": ("bfloat16", "highest"),
+}
+
+
+@pytest.mark.parametrize("variable", SWITCHES)
 def test_other_arithmetic_is_refused(suite, never, monkeypatch, variable):
-    monkeypatch.setenv(variable, "1")
-    refused(suite("run", *SMOKE), f"{variable}=1 is set in the environment", "unset it")
-    monkeypatch.setenv(variable, "False")
+    wrong, right = SWITCHES[variable]
+    monkeypatch.setenv(variable, wrong)
+    refused(suite("run", *SMOKE), f"{variable}={wrong} is set in the environment", "unset it")
+    monkeypatch.setenv(variable, right)
     with pytest.raises(AssertionError, match="should have been refused"):
         suite("run", *SMOKE)
 
 
-@pytest.mark.parametrize("asked", ["cuda", "nothing"])
-def test_a_kind_of_device_that_is_not_there(asked):
+def test_other_arithmetic_of_a_program_is_refused(suite, never):
+    import jax
+
+    with jax.enable_x64(True):
+        refused(suite("run", *SMOKE), "jax.config.jax_enable_x64 is True")
+
+
+@pytest.mark.parametrize(
+    ("variable", "asked"), [("JAX_PLATFORMS", "cuda"), ("JAX_PLATFORMS", "nothing"), ("JAX_PLATFORM_NAME", "cuda")]
+)
+def test_a_kind_of_device_that_is_not_there(variable, asked):
     """In a process of its own, whose JAX has no device yet; and `python -m suite` is the command."""
     words = [sys.executable, "-m", "suite", "run", *SMOKE]
-    ran = subprocess.run(words, env=os.environ | {"JAX_PLATFORMS": asked}, capture_output=True, text=True, check=False)
-    refused((ran.returncode, ran.stdout, ran.stderr), f"no device for JAX_PLATFORMS='{asked}'", "JAX_PLATFORMS=cpu")
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_PLATFORMS"} | {variable: asked}
+    ran = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    refused((ran.returncode, ran.stdout, ran.stderr), f"no device for {variable}={asked}; this machine has: ", "cpu")
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
