@@ -113,10 +113,11 @@ def _engine(args: argparse.Namespace) -> Iterator[tuple[Callable[[Run], Handle],
 @contextlib.contextmanager
 def _display(quiet: bool) -> Iterator[Callable[[Sequence[Run], bool], None]]:
     """Shows runs as they go: one live table on a terminal; elsewhere a line whenever a status changes."""
-    from rich.console import Console
     from rich.live import Live
 
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    from suite.runtime.reporting import stderr_console
+
+    console = stderr_console()
     if quiet:
         yield lambda runs, stopping: None
     elif console.is_terminal:

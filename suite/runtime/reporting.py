@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 import time
 from collections import deque
-from typing import Protocol
+from typing import IO, Protocol, TextIO, cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -35,11 +37,46 @@ class Reporter(Protocol):
         """No more progress will come."""
 
 
+class _Stderr:
+    """The present stderr, which may go away: a terminal is closed, or whoever read the pipe has gone.
+
+    What runs must then come to its good end, so that what cannot be shown is dropped.
+    """
+
+    @property
+    def _file(self) -> TextIO:
+        return getattr(sys.stderr, "rich_proxied_file", sys.stderr)  # a live bar stands in front of it
+
+    @property
+    def encoding(self) -> str:
+        return self._file.encoding
+
+    def write(self, text: str) -> int:
+        with contextlib.suppress(OSError):
+            self._file.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with contextlib.suppress(OSError):
+            self._file.flush()
+
+    def isatty(self) -> bool:
+        return self._file.isatty()
+
+    def fileno(self) -> int:
+        return self._file.fileno()
+
+
+def stderr_console() -> Console:
+    """Where progress is shown."""
+    return Console(file=cast(IO[str], _Stderr()), highlight=False, soft_wrap=True)
+
+
 class QuietReporter:
     """Warnings only."""
 
     def __init__(self, console: Console | None = None):
-        self._console = console or Console(stderr=True, highlight=False, soft_wrap=True)
+        self._console = console or stderr_console()
 
     def message(self, text: str) -> None:
         pass

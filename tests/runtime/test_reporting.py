@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import errno
 import io
+import sys
 
 import pytest
 from rich.console import Console
@@ -84,3 +86,30 @@ def test_quiet_is_quiet_but_for_warnings():
     reporter.warning("checkpoint [2] is damaged")
     reporter.stop()
     assert reporter._console.file.getvalue() == "warning: checkpoint [2] is damaged\n"
+
+
+class Gone(io.StringIO):
+    """A terminal that was closed."""
+
+    def __init__(self, terminal):
+        super().__init__()
+        self.terminal = terminal
+
+    def isatty(self):
+        return self.terminal
+
+    def write(self, text=""):
+        raise OSError(errno.EIO, "Input/output error")
+
+    flush = write
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_closed_terminal_ends_no_run(monkeypatch, terminal):
+    monkeypatch.setattr(sys, "stderr", Gone(terminal))
+    reporter = RichReporter(interval=0)
+    reporter.start(1000, 0)
+    reporter.update(100, "collect", {"return": 1.5})
+    reporter.message("stopping")
+    reporter.warning("careful")
+    reporter.stop()
