@@ -82,7 +82,7 @@ def write_page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame], fol
     Raises:
       UserError: the folder cannot be written.
     """
-    require_writable(folder)
+    require_writable(folder, "--page")
     write_whole(folder / PAGE, page(entries, tables))
     return folder / PAGE
 

@@ -116,8 +116,7 @@ def _names(records: Sequence[RunRecord]) -> list[str]:
 
 def _codebook(record: RunRecord) -> pd.DataFrame:
     """How many codes the tokenizer had or used over training: columns "step" and "codes", maybe no rows."""
-    path, column = record.folder / "metrics.csv", "tokenizer/codes"
-    table = pd.read_csv(path) if path.exists() and path.stat().st_size else pd.DataFrame()
+    table, column = record.table("metrics"), "tokenizer/codes"
     if column not in table:
         return pd.DataFrame({"step": [], "codes": []})
     return table[["step", column]].rename(columns={column: "codes"}).dropna()

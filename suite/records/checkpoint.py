@@ -2,17 +2,20 @@
 
 `checkpoints/step_<n>/` holds `model` (what evaluation needs), `resume` (what only going on needs: environments, replay,
 optimizers), `host.json` (plain values) and `manifest.json` (size and CRC-32 of every file), written last. A checkpoint
-whose files differ from its manifest does not count: the one before it is used.
+whose files differ from its manifest, or which has another step's name, does not count: the one before it is used.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import logging
 import os
+import re
 import shutil
+import sys
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -48,7 +51,7 @@ def save(folder: Path, step: int, model: Any, resume: Any, host: dict[str, Any],
       step: real environment steps; a checkpoint of the same step is replaced.
       model: pytree of arrays, typed PRNG keys included.
       resume: likewise.
-      host: JSON values.
+      host: JSON values; "steps" is added.
       keep: how many checkpoints stay.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -58,7 +61,7 @@ def save(folder: Path, step: int, model: Any, resume: Any, host: dict[str, Any],
     try:
         _save_tree(partial / "model", model)
         _save_tree(partial / "resume", resume)
-        (partial / "host.json").write_text(json.dumps(host))
+        (partial / "host.json").write_text(json.dumps(host | {"steps": step}))
         _write_manifest(partial)
         if final.exists():
             shutil.rmtree(final)
@@ -98,9 +101,7 @@ def restore_latest(folder: Path, model_template: Any, resume_template: Any = Non
             warnings=tuple(warnings),
         )
     if steps:
-        raise UserError(
-            f"{'; '.join(warnings)}; no checkpoint in {folder} is whole: choose another --out to start anew"
-        )
+        raise UserError(f"{'; '.join(warnings)}; no checkpoint in {folder} is whole")
     return None
 
 
@@ -128,7 +129,7 @@ def _name(step: int) -> str:
 def _steps(folder: Path) -> list[int]:
     """Steps of all finished checkpoints, newest first."""
     names = (path.name.removeprefix("step_") for path in folder.glob("step_*"))
-    return sorted((int(name) for name in names if name.isdigit()), reverse=True)
+    return sorted((int(name) for name in names if re.fullmatch("[0-9]{12,}", name)), reverse=True)
 
 
 def _leaves(tree: Any) -> dict[str, Any]:
@@ -142,15 +143,29 @@ def _orbax() -> Iterator[Any]:
     """An Orbax checkpointer. zarr3 in one OCDBT store: few files, and no slower than one file per array."""
     import orbax.checkpoint as ocp
 
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)  # what goes wrong in its threads is raised here, too: once is enough
+    _quiet_orbax()
     checkpointer = ocp.Checkpointer(ocp.PyTreeCheckpointHandler(use_ocdbt=True, use_zarr3=True))
     try:
         yield checkpointer
     finally:
         checkpointer.close()
-        logger.setLevel(level)
+
+
+@functools.cache
+def _quiet_orbax() -> None:
+    """Silences what Orbax's threads, tasks and writes say of an error, for as long as they go on after it.
+
+    The error itself is raised here, too: once is enough.
+    """
+    logging.getLogger("absl").addFilter(lambda record: "orbax" not in record.pathname)
+    logging.getLogger("asyncio").addFilter(lambda record: "orbax" not in record.getMessage())
+    hook = sys.unraisablehook
+
+    def heard(raised: sys.UnraisableHookArgs) -> None:
+        if not (isinstance(raised.exc_value, RuntimeError) and str(raised.exc_value) == "Event loop is closed"):
+            hook(raised)
+
+    sys.unraisablehook = heard
 
 
 def _save_tree(path: Path, tree: Any) -> None:
@@ -212,18 +227,26 @@ def _fits(name: str, wanted: dict[str, Any], stored: dict[str, Any]) -> bool:
 
 def _write_manifest(path: Path, without: str = "") -> None:
     """Sizes and checksums of all files but those under the folder `without`."""
-    files = [file for file in sorted(path.rglob("*")) if file.is_file() and file.name != MANIFEST]
-    names = {file.relative_to(path): file for file in files}
-    entries = {
-        str(name): [file.stat().st_size, _crc32(file)] for name, file in names.items() if name.parts[0] != without
-    }
+    names = [name for name in _files(path) if name.parts[0] != without]
+    entries = {str(name): [(path / name).stat().st_size, _crc32(path / name)] for name in names}
     write_whole(path / MANIFEST, json.dumps(entries).encode())
+
+
+def _files(path: Path) -> list[Path]:
+    """All that a manifest lists, relative to the checkpoint: not itself, what a kill left of it, or hidden files."""
+    files = (file.relative_to(path) for file in sorted(path.rglob("*")) if file.is_file())
+    ours = (MANIFEST, f"{MANIFEST}.partial")
+    return [file for file in files if file.parts[0] not in ours and not file.name.startswith(".")]
 
 
 def _damage(path: Path) -> str:
     """What is wrong with a checkpoint, "" if nothing is."""
     try:
         entries = json.loads((path / MANIFEST).read_text())
+        dropped = not any(name.startswith("resume/") for name in entries)  # a kill may have left a part of it
+        for file in _files(path):
+            if str(file) not in entries and not (dropped and file.parts[0] == "resume"):
+                return f"{file} is not in {MANIFEST}"
         for name, (size, checksum) in entries.items():
             file = path / name
             if not file.is_file():
@@ -232,7 +255,9 @@ def _damage(path: Path) -> str:
                 return f"{name} has {file.stat().st_size} bytes of {size}"
             if _crc32(file) != checksum:
                 return f"{name} has changed"
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+        if (step := json.loads((path / "host.json").read_text())["steps"]) != int(path.name.removeprefix("step_")):
+            return f"it is of step {step:,}"
+    except (OSError, LookupError, ValueError, TypeError, AttributeError) as error:
         return f"{MANIFEST} cannot be read: {type(error).__name__}"
     return ""
 

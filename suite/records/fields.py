@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import (
     BaseModel,
@@ -23,6 +23,7 @@ from suite.records.tables import write_whole
 from suite.runtime.errors import UserError
 
 SCHEMA = 1
+Status = Literal["running", "stopped", "failed", "finished"]
 FILE = "record.json"
 
 
@@ -67,7 +68,7 @@ class RecordFields(_Part):
     max_return: float | None
     achievements: list[str]
     columns: dict[str, list[str] | None]
-    status: str
+    status: Status
     steps: NonNegativeInt
     started: str
     ended: str | None

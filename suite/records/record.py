@@ -23,6 +23,7 @@ import errno
 import fcntl
 import os
 import platform
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -31,10 +32,10 @@ from pydantic import ValidationError
 
 from suite import registry
 from suite.configuration.overrides import dotted, first_problem
-from suite.configuration.schema import Config
+from suite.configuration.schema import Config, hash_of
 from suite.records.fields import SCHEMA, ProtocolFields, RecordFields, read_json, write_json
 from suite.records.provenance import package_version, peak_memory, provenance
-from suite.records.tables import CsvTable
+from suite.records.tables import CsvTable, read_table
 from suite.runtime.errors import FolderInUseError, RunError, UserError
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from suite.interface.environment import EnvironmentSpec
 
 LOCK = "run.lock"
+FULL, BROKEN = (errno.ENOSPC, errno.EDQUOT), (errno.EROFS, errno.EIO, errno.EFBIG, errno.ESTALE)
 
 
 def run_folder(out: Path, config: Config) -> Path:
@@ -50,43 +52,43 @@ def run_folder(out: Path, config: Config) -> Path:
     return out / config.task / config.agent / config.preset / f"seed_{config.seed}"
 
 
-def require_writable(folder: Path) -> None:
-    """Creates `folder` if it is not there.
+def require_writable(folder: Path, option: str = "--out") -> None:
+    """Creates `folder`, which the user chose by this option, if it is not there.
 
     Raises:
       UserError: it cannot be created or written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".writable.{os.getpid()}"
-        probe.touch()
-        probe.unlink()
+        tempfile.TemporaryFile(dir=folder).close()  # has no name that a kill could leave behind
     except OSError as error:
-        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
+        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another {option}") from error
 
 
 @contextlib.contextmanager
-def disk_full_is_an_error() -> Iterator[None]:
-    """Turns a full disk, wherever inside it is noticed, into a `RunError`."""
+def refused_writes_are_errors() -> Iterator[None]:
+    """Turns what a full or broken disk refuses, wherever inside it is noticed, into a `RunError`."""
     try:
         yield
+    except RunError:
+        raise
     except Exception as error:
-        if not _says_disk_full(error):
+        reason = _refused_write(error)
+        if reason is None:
             raise
-        raise RunError(
-            "disk full; the last checkpoint is intact: free some space and run the same command again"
-        ) from error
+        what = "disk full" if reason in FULL else f"cannot write: {os.strerror(reason)}"
+        remedy = "free some space" if reason in FULL else "see to the disk"
+        raise RunError(f"{what}; the last checkpoint is intact: {remedy} and run the same command again") from error
 
 
-def _says_disk_full(error: BaseException | None) -> bool:
-    """Also where a library wraps the system's error, or only quotes it."""
+def _refused_write(error: BaseException | None) -> int | None:
+    """The system's number for why it refused to write, also where a library wraps its error or only quotes it."""
     while error is not None:
-        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-            return True
-        if os.strerror(errno.ENOSPC) in str(error):
-            return True
+        for number in (*FULL, *BROKEN):
+            if (isinstance(error, OSError) and error.errno == number) or os.strerror(number) in str(error):
+                return number
         error = error.__cause__ or error.__context__
-    return False
+    return None
 
 
 def protocol(config: Config, spec: EnvironmentSpec) -> ProtocolFields:
@@ -172,6 +174,7 @@ class RunRecord:
         fields.write(folder)  # last: a folder is a run from here on
         record = cls(folder, config, fields, spec, lock)
         record._new = True
+        record._begin_tables()
         return record
 
     @classmethod
@@ -187,13 +190,13 @@ class RunRecord:
           lock: for writing; without it, only for reading.
 
         Raises:
-          UserError: no run folder, another schema, damaged, another run than expected, or in use.
+          UserError: no run folder, another schema, damaged, changed, another run than expected, or in use.
         """
         RecordFields.read(folder)  # nothing, not even a lock, is written into a folder that holds no run
         held = _acquire(folder) if lock else None
         try:
             fields = RecordFields.read(folder)
-            stored = _read_config(folder)
+            stored = _read_config(folder, fields)
             if config is not None:
                 _require_same_run(folder, stored, config)
             if config is not None and spec is not None:
@@ -240,12 +243,13 @@ class RunRecord:
         self._append("episodes", rows)
 
     def append_evaluation(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Adds evaluation episodes: as `append_episodes`, `step` being that of the checkpoint."""
-        self._append("evaluations", rows)
+        """Adds evaluation episodes, all or none: as `append_episodes`, `step` being that of the checkpoint."""
+        self.require_own_folder()
+        self._tables["evaluations"].append_whole(rows)
 
-    def has_evaluation(self, step: int) -> bool:
-        """Whether there are evaluation episodes of the checkpoint at `step`."""
-        return any(row.startswith(f"{step},") for row in (self.folder / "evaluations.csv").read_text().splitlines())
+    def has_evaluation(self, step: int, episodes: int) -> bool:
+        """Whether there are at least so many evaluation episodes of the checkpoint at `step`."""
+        return int((self.table("evaluations")["step"] == step).sum()) >= episodes
 
     def append_metrics(self, row: Mapping[str, Any], names: Iterable[str] = ()) -> None:
         """Adds one iteration's metrics, `step` first.
@@ -267,10 +271,10 @@ class RunRecord:
         self._append("timing", [row])
 
     def _append(self, table: str, rows: Iterable[Mapping[str, Any]], names: Iterable[str] = ()) -> None:
-        self._require_own_folder()
+        self.require_own_folder()
         self._tables[table].append(rows, names)
 
-    def _require_own_folder(self) -> None:
+    def require_own_folder(self) -> None:
         """Raises a RunError if the folder was removed, or made anew by another run: rows of the two would mix."""
         assert self._lock is not None, "opened for reading only"
         held = os.fstat(self._lock.fileno())
@@ -285,24 +289,55 @@ class RunRecord:
         """Goes back to a checkpoint: rows beyond `step` move to `replaced/`. Returns how many did.
 
         The run plays those steps again, identically. What TensorBoard shows of them is replaced as well.
+
+        Raises:
+          UserError: rows up to `step` are missing or damaged; nothing was moved.
         """
-        folders = self.folder / "replaced"
-        number = 1 + sum(1 for _ in folders.glob("*"))
-        aside = folders / f"{number:04d}_after_step_{step}"
-        moved = 0
-        for name, columns in self.fields.columns.items():
-            moved += self._tables[name].rewind(step, aside / f"{name}.csv")
-            self._tables[name] = CsvTable(self.folder / f"{name}.csv", columns)
+        # Of a game that ends with a move of chance, which is no step, an episode may have the step of an iteration
+        # that ended before it: so many are counted, not those up to a step.
+        most = self._counted(step, self.table("episodes"))
+        aside = self._aside(step)
+        moved = sum(
+            table.rewind(step, aside / f"{name}.csv", most if name == "episodes" else None)
+            for name, table in self._tables.items()
+        )
+        self._begin_tables()
         if not self._new:  # a run that has only just begun is not resumed
             self._purge_step = step + 1
             resumed = {"step": step, "date": _now(), **provenance()}
             self.update(steps=step, resumed=[*self.fields.resumed, resumed])
         return moved
 
+    def rewind_evaluations(self, step: int) -> None:
+        """Moves the evaluation episodes of the checkpoint at `step`, the newest, to `replaced/`: not all are there."""
+        self._tables["evaluations"].rewind(step - 1, self._aside(step - 1) / "evaluations.csv")
+
+    def _aside(self, step: int) -> Path:
+        folders = self.folder / "replaced"
+        return folders / f"{1 + sum(1 for _ in folders.glob('*')):04d}_after_step_{step}"
+
+    def _begin_tables(self) -> None:
+        for name, columns in self.fields.columns.items():
+            self._tables[name] = CsvTable(self.folder / f"{name}.csv", columns)
+            self._append(name, [])
+
+    def _counted(self, step: int, episodes: pd.DataFrame) -> int:
+        """How many episodes had ended by the iteration that ended at `step`; a UserError if others are there."""
+        metrics = self.table("metrics")
+        until = metrics[metrics["step"] <= step]
+        if not step and until.empty:
+            return 0
+        if until.empty or until["step"].iloc[-1] != step or "episodes" not in until:
+            raise UserError(f"{self.folder}/metrics.csv lacks the iteration that ended at step {step:,}")
+        found, counted = len(episodes), int(until["episodes"].sum())
+        if found < counted or (self.finished and found > counted):
+            raise UserError(f"{self.folder}/episodes.csv has {found:,} episodes, metrics.csv counted {counted:,}")
+        return counted
+
     def update(self, **fields: Any) -> None:
         """Replaces fields of record.json."""
         replaced = self.fields.replaced(**fields)
-        self._require_own_folder()
+        self.require_own_folder()
         self.fields = replaced
         self.fields.write(self.folder)
 
@@ -320,22 +355,25 @@ class RunRecord:
         self.update(status="finished", steps=steps, ended=_now())
 
     def episodes(self) -> pd.DataFrame:
-        """The training episodes; see `leaderboards.scoring`."""
-        return self.table("episodes")
-
-    def table(self, name: str) -> pd.DataFrame:
-        """One of the CSV files, by its name without the ending.
+        """The training episodes; see `leaderboards.scoring`.
 
         Raises:
-          UserError: it cannot be read.
+          UserError: the table cannot be read, or of a finished run other episodes are there than were counted.
         """
-        import pandas as pd
+        episodes = self.table("episodes")
+        if self.finished:
+            self._counted(self.steps, episodes)
+        return episodes
 
-        path = self.folder / f"{name}.csv"
-        try:
-            return pd.read_csv(path)
-        except (OSError, ValueError) as error:
-            raise UserError(f"cannot read {path}: {error}") from error
+    def table(self, name: str) -> pd.DataFrame:
+        """One of the CSV files, by its name without the ending; of a run that is not finished, the rows so far.
+
+        Raises:
+          UserError: it is missing, cut off, has other columns, or holds what is no number.
+        """
+        path, columns = self.folder / f"{name}.csv", self.fields.columns[name]
+        # A metric may have none: of dreams before the first one, or of episodes where none ended.
+        return read_table(path, columns, growing=not self.finished, gaps=name == "metrics")
 
     def close(self) -> None:
         """Lets other processes open the folder."""
@@ -358,7 +396,7 @@ def _acquire(folder: Path) -> IO[str]:
     try:
         file = (folder / LOCK).open("a+")
     except OSError as error:
-        raise UserError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
+        raise UserError(f"cannot write to {folder}: {error.strerror}") from error
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -388,12 +426,23 @@ def _require_same_rules(folder: Path, old: ProtocolFields, new: ProtocolFields) 
             )
 
 
-def _read_config(folder: Path) -> Config:
-    fields = read_json(folder, "config.json")
+def _read_config(folder: Path, record: RecordFields) -> Config:
+    """The configuration that was run: what `record` has the digest of."""
+    stored = read_json(folder, "config.json")
     try:
-        return Config(**fields)
+        config = Config(**stored)
     except ValidationError as error:
         raise UserError(f"{folder}/config.json is not of this version: {first_problem(error)}") from error
+    for name in ("task", "agent", "preset", "seed"):
+        if getattr(record, name) != getattr(config, name):
+            raise UserError(
+                f"{folder}/record.json says {name}={getattr(record, name)}, config.json {getattr(config, name)}"
+            )
+    # Of the file as it was written, as `Config.digest`: later versions may have fields more.
+    digest = hash_of({name: value for name, value in stored.items() if name not in ("checkpoint", "evaluation")})
+    if record.config_digest != digest:
+        raise UserError(f"{folder}/config.json is not the configuration that was run ({record.config_digest})")
+    return config
 
 
 def _now() -> str:

@@ -7,9 +7,14 @@ import io
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from suite.runtime.errors import UserError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 class CsvTable:
@@ -20,7 +25,7 @@ class CsvTable:
     """
 
     def __init__(self, path: Path, columns: Sequence[str] | None = None):
-        """Opens the table, or creates it with its header line.
+        """The table, whose file need not be there yet.
 
         Args:
           path: the file.
@@ -28,11 +33,10 @@ class CsvTable:
         """
         self.path = path
         self.columns = tuple(columns) if columns else _header(path)
-        if columns:
-            self.append([])
 
     def append(self, rows: Iterable[Mapping[str, Any]], names: Iterable[str] = ()) -> None:
-        """Adds rows at the end: all of them, on disk when this returns, or none. What a row leaves out stays empty.
+        """Adds rows at the end, or at least the header line: all on disk when this returns. What a row leaves out stays
+        empty. A kill may leave some rows and a part of one: `rewind` goes back to where all of them are there.
 
         Args:
           rows: values by column.
@@ -47,13 +51,9 @@ class CsvTable:
             if not rows:
                 return
             self.columns = tuple(dict.fromkeys([*rows[0], *names]))
-        for row in rows:
-            if unknown := row.keys() - set(self.columns):
-                raise ValueError(f"{self.path.name} has no column {', '.join(sorted(unknown))}")
         with self.path.open("a+b", buffering=0) as file:
             size = _whole_rows(file)
-            header = [] if size else [self.columns]
-            lines = _lines([*header, *([cell(row.get(name)) for name in self.columns] for row in rows)])
+            lines = self._text(rows, header=not size)
             try:
                 if lines:
                     file.truncate(size)
@@ -64,21 +64,78 @@ class CsvTable:
                 file.truncate(size)
                 raise
 
-    def rewind(self, step: int, aside: Path) -> int:
-        """Moves rows beyond `step`, and a last row that was cut off, to the file `aside`; returns how many."""
+    def append_whole(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """As `append`, but a kill leaves all of the rows or none: the file is written anew, so it should be small."""
+        before = self.path.read_bytes() if self.path.exists() else b""
+        before = before[: before.rfind(b"\n") + 1]
+        write_whole(self.path, before + self._text(list(rows), header=not before))
+
+    def _text(self, rows: Sequence[Mapping[str, Any]], header: bool) -> bytes:
+        for row in rows:
+            if unknown := row.keys() - set(self.columns):
+                raise ValueError(f"{self.path.name} has no column {', '.join(sorted(unknown))}")
+        lines = ([cell(row.get(name)) for name in self.columns] for row in rows)
+        return _lines([*([self.columns] if header else []), *lines])
+
+    def rewind(self, step: int, aside: Path, most: int | None = None) -> int:
+        """Moves rows beyond `step` or `most` of them, and a last row that was cut off, to `aside`; returns how many."""
         if not self.path.exists():
             return 0
         header, *rows = self.path.read_bytes().splitlines(keepends=True) or [b""]
         if not header.endswith(b"\n"):
             header, rows = b"", [header]
-        kept = [row for row in rows if _whole_and_until(row, step)]
-        moved = [row for row in rows if not _whole_and_until(row, step)]
+        kept, moved = list[bytes](), list[bytes]()
+        for row in rows:
+            stays = _whole_and_until(row, step) and (most is None or len(kept) < most)
+            (kept if stays else moved).append(row)
         if moved:
             aside.parent.mkdir(parents=True, exist_ok=True)
             # First the copy, then the cut: a kill in between leaves rows twice, never lost.
             write_whole(aside, header + b"".join(moved))
             write_whole(self.path, header + b"".join(kept))
         return len(moved)
+
+
+def read_table(path: Path, columns: Sequence[str] | None, growing: bool, gaps: bool) -> pd.DataFrame:
+    """All rows of such a file.
+
+    Args:
+      path: the file.
+      columns: those that it must have; None: whatever its first line says.
+      growing: it may not be there yet, and its last row may not be whole yet, and then does not count.
+      gaps: cells may be empty.
+
+    Raises:
+      UserError: it is missing or cut off, has other columns, or a cell that is no finite number.
+    """
+    import pandas as pd
+
+    try:
+        text = path.read_bytes().decode(errors="replace")
+    except FileNotFoundError:
+        if growing:
+            return pd.DataFrame(columns=list(columns or ("step",)), dtype=float)
+        raise UserError(f"{path} is missing") from None
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror}") from error
+    whole, newline, rest = text.rpartition("\n")
+    lines = whole.split("\n") if newline else []
+    if not growing and (rest or not lines):
+        raise UserError(f"{path} is cut off in line {len(lines) + 1}")
+    header = tuple(lines[0].split(",")) if lines else tuple(columns or ("step",))
+    if header != tuple(columns or header) or header[0] != "step":
+        raise UserError(f"{path} has columns {', '.join(header)}, not {', '.join(columns or ('step', '...'))}")
+    for number, line in enumerate(lines[1:], 2):
+        if line.count(",") != len(header) - 1:
+            raise UserError(f"{path} line {number} has {line.count(',') + 1} cells, not {len(header)}")
+    table = pd.read_csv(io.StringIO("\n".join([",".join(header), *lines[1:]])), keep_default_na=False, na_values=[""])
+    for name in map(str, table):
+        numbers = pd.to_numeric(table[name], errors="coerce").to_numpy(float)
+        wrong = ~np.isfinite(numbers) & (table[name].notna() | (not gaps or name == "step")).to_numpy(bool)
+        if wrong.any():
+            row = int(np.flatnonzero(wrong)[0])
+            raise UserError(f"{path} line {row + 2}: {name} is {table[name].iloc[row]}, not a finite number")
+    return table
 
 
 def write_whole(path: Path, content: bytes) -> None:
@@ -123,7 +180,7 @@ def _whole_rows(file: io.FileIO) -> int:
 def _header(path: Path) -> tuple[str, ...]:
     if not path.exists():
         return ()
-    with path.open(newline="") as file:
+    with path.open(newline="", errors="replace") as file:
         return tuple(next(csv.reader(file), ()))
 
 

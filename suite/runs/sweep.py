@@ -277,7 +277,8 @@ class Process:
         died = code < 0
         if code in STOPPED or (self._told and died):
             return Outcome("stopped")
-        reason = lines[-1] if lines else f"exit code {code}"
+        errors = [line for line in lines if line.startswith("error: ")]
+        reason = (errors or lines or [f"exit code {code}"])[-1]
         now = time.monotonic()
         if code == FolderInUseError.exit_code and now < self._first + PATIENCE:
             self._next = now + AGAIN

@@ -19,7 +19,7 @@ from suite.agent.state import TrainState
 from suite.configuration.schema import Config
 from suite.interface.environment import EnvironmentSpec
 from suite.records import checkpoint
-from suite.records.record import RunRecord, disk_full_is_an_error, run_folder
+from suite.records.record import RunRecord, refused_writes_are_errors, run_folder
 from suite.runs.evaluation import episode_rows, record_evaluation
 from suite.runs.saved_model import Remainder, SavedModel, agent_for
 from suite.runtime.compilation import Ahead
@@ -90,8 +90,9 @@ def run(
     folder = run_folder(out, config)
     if resume and not (folder / "record.json").exists():
         raise UserError(f"nothing to resume in {folder}: run without --resume to start there")
-    with RunRecord.open_or_create(folder, config, entry.spec()) as record, disk_full_is_an_error():
+    with RunRecord.open_or_create(folder, config, entry.spec()) as record, refused_writes_are_errors():
         if record.finished:
+            checkpoint.drop_resume(folder / "checkpoints")  # a kill may have come before
             return _result(record, "already finished")
         return _Training(config, agent_for(config, reporter), record, reporter, callbacks).run()
 
@@ -143,7 +144,7 @@ class _Training:
         self.log = IterationLog(agent.spec, 0)  # of the present iteration
         self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
         self.recorded_seconds: dict[str, float] = {}  # of those, what timing.csv has
-        self.stop_requested = False
+        self.stop_requested = self.stop_now = self.saving = False
         self.ahead = Ahead()
 
     @property
@@ -188,7 +189,10 @@ class _Training:
         key = start_key(self.config.seed)
         template = jax.eval_shape(self.agent.init, key)
         remainder = Remainder.of(template).stored()
-        restored = checkpoint.restore_latest(self.checkpoints, SavedModel.of(template), remainder)
+        try:
+            restored = checkpoint.restore_latest(self.checkpoints, SavedModel.of(template), remainder)
+        except UserError as error:
+            raise UserError(f"{error}; choose another --out to start anew") from error
         if restored is None:
             self.record.rewind(0)
             self.ahead.begin(first_programs(self.agent, template))
@@ -198,11 +202,17 @@ class _Training:
         self.iteration, self.steps = restored.host["iteration"], restored.host["steps"]
         self.seconds = restored.host["seconds"]
         self.recorded_seconds = dict(self.seconds)
+        if restored.resume is None and not self.done:
+            raise UserError(
+                f"{self.checkpoints} holds only the model of step {self.steps:,}, which cannot be trained on"
+            )
         self.record.rewind(self.steps)
         self.reporter.message(f"resuming at step {self.steps:,}")
         if not self.done:
             self.ahead.begin(first_programs(self.agent, template))
-        return Remainder(**restored.resume).with_model(restored.model)
+        # A run that was killed at its end has dropped what only going on needs.
+        resume = restored.resume or dict.fromkeys(remainder)
+        return Remainder(**resume).with_model(restored.model)
 
     def _iterate(self, state: TrainState) -> TrainState:
         """One iteration of Algorithm 1, and what it leaves in the record."""
@@ -260,30 +270,40 @@ class _Training:
                 raise RunError(f"{name} became {value} in phase {phase} at step {self.steps:,}; {where}")
 
     def _evaluate(self, state: TrainState) -> None:
-        """Plays whole episodes with the present policy, unless there are some of this step already."""
-        if self.record.has_evaluation(self.steps):
+        """Plays whole episodes with the present policy, unless there are enough of this step already."""
+        episodes = self.config.evaluation.episodes
+        if self.record.has_evaluation(self.steps, episodes):
             return
         with self._phase("evaluate"):
-            episodes = self.config.evaluation.episodes
+            self.record.rewind_evaluations(self.steps)
             record_evaluation(self.record, self.agent, state.policy.acting, self.steps, episodes)
 
     def _save(self, state: TrainState) -> None:
         with self._phase("checkpoint"):
-            host = {"iteration": self.iteration, "steps": self.steps, "seconds": self.seconds}
+            host = {"iteration": self.iteration, "seconds": self.seconds}
             model, remainder = SavedModel.of(state), Remainder.of(state).stored()
+            self.record.require_own_folder()
+            self.saving = True
             checkpoint.save(self.checkpoints, self.steps, model, remainder, host, keep=self.config.checkpoint.keep)
+            self.saving = False
+        if self.stop_now:
+            raise KeyboardInterrupt
 
     def _finish(self, state: TrainState) -> None:
         """Saves the last checkpoint, plays the final evaluation, and closes the record."""
         if checkpoint.latest_step(self.checkpoints) != self.steps:
             self._save(state)
         self._evaluate(state)
-        self.record.finish(self.steps)
         checkpoint.drop_resume(self.checkpoints)
+        self.record.finish(self.steps)  # last: what is finished is never touched again
 
     def _heard(self, count: int) -> None:
-        """The first SIGINT or SIGTERM ends the run after this iteration, with a checkpoint; the second at once."""
-        if count > 1:
+        """The first signal ends the run after this iteration, with a checkpoint; the second at once.
+
+        A checkpoint that is being written is not interrupted: it takes seconds, and its threads would go on.
+        """
+        self.stop_now = count > 1
+        if self.stop_now and not self.saving:
             raise KeyboardInterrupt
         self.stop_requested = True
         self.reporter.message("stopping after this iteration, with a checkpoint (again: stop now)")

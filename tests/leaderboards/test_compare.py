@@ -27,6 +27,7 @@ def write(tmp_path):
                 unlocked = {name: int(i < count) for i, name in enumerate(SPEC.achievements)}
                 row = {"step": step, "return": count - 0.9, "length": 9, "health_return": -0.9, **unlocked}
                 record.append_episodes([row | {"achievement_return": float(count)}])
+                record.append_metrics({"step": step, "episodes": 1, "return": row["return"]})
             if finish:
                 record.finish(64)
         return record.folder

@@ -195,13 +195,19 @@ REFUSALS = {
     "too long": (swap(EPISODES, ",3.0,5", ",3.0,1001"), "line 3: length is 1001, minatar/breakout allows 1 to 1000"),
     "no time": (swap(EPISODES, "51200,1.0,5", "32,1.0,5"), "line 2: 5 steps long, and ends before it can have begun"),
     "too many": (
-        put(EPISODES, b"step,return,length\n" + b"3200,1.0,200\n" * 17),
+        lambda folder: (
+            put(EPISODES, b"step,return,length\n" + b"3200,1.0,200\n" * 17)(folder),
+            put(METRICS, b"step,episodes,return\n102400,17,1.0\n")(folder),
+        ),
         "line 18: the episodes so far have more steps than were taken, 3,200",
     ),
-    "no episodes": (lambda folder: (folder / EPISODES).unlink(), "cannot read episodes.csv"),
-    "unreadable": (put(EPISODES, b"\xff\xfe\x00"), "cannot read episodes.csv"),
-    "other metrics": (put(METRICS, b"step\n1\n"), "metrics.csv lacks episodes, return"),
-    "unreadable metrics": (put(METRICS, b"\xff"), "cannot read metrics.csv"),
+    "no episodes": (lambda folder: (folder / EPISODES).unlink(), "episodes.csv is missing"),
+    "unreadable": (put(EPISODES, b"\xff\xfe\x00"), "episodes.csv is cut off in line 1"),
+    "cut off": (put(EPISODES, b"step,return,length\n51200,1.0,5\n102400,3"), "episodes.csv is cut off in line 3"),
+    "a cell less": (swap(EPISODES, "51200,1.0,5", "51200,1.0"), "episodes.csv line 2 has 2 cells, not 3"),
+    "other metrics": (put(METRICS, b"step\n1\n"), "metrics.csv lacks the iteration that ended at step 102,400"),
+    "metrics without returns": (put(METRICS, b"step,episodes\n102400,2\n"), "metrics.csv lacks return"),
+    "unreadable metrics": (put(METRICS, b"\xff"), "metrics.csv is cut off in line 1"),
     "no object": (put(RECORD, b"[]"), "record.json is damaged"),
 }
 

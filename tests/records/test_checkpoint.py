@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 import subprocess
 import sys
@@ -67,7 +68,7 @@ def some_file(path, item="model"):
 def test_round_trip_to_the_bit(tmp_path):
     save(tmp_path, 3)
     found = restore(tmp_path)
-    assert (found.step, found.host, found.warnings) == (3, {"iteration": 3}, ())
+    assert (found.step, found.host, found.warnings) == (3, {"iteration": 3, "steps": 3}, ())
     assert_same(found.model, model(3))
     assert_same(found.resume, resume(3))
     assert jax.random.uniform(found.resume["key"]) == jax.random.uniform(jax.random.key(5))
@@ -125,6 +126,11 @@ def broken_manifest(path):
     (path / "manifest.json").write_text('{"model')
 
 
+def emptied_manifest(path):
+    (path / "manifest.json").write_text("{}")
+    flip(path)
+
+
 DAMAGE = {
     "truncated": (truncate, "bytes of"),
     "flipped bit": (flip, "has changed"),
@@ -133,6 +139,7 @@ DAMAGE = {
     "host deleted": (lambda path: (path / "host.json").unlink(), "host.json is missing"),
     "manifest deleted": (lambda path: (path / "manifest.json").unlink(), "manifest.json cannot be read"),
     "manifest broken": (broken_manifest, "manifest.json cannot be read"),
+    "manifest emptied": (emptied_manifest, "is not in manifest.json"),
     "empty": (empty, "manifest.json cannot be read"),
 }
 
@@ -155,6 +162,30 @@ def test_the_one_before_a_damaged_one_is_used(saved, tmp_path, name):
     assert_same((found.model, found.resume), (model(1000), resume(1000)))
     (warning,) = found.warnings
     assert warning.startswith("checkpoint at step 2,000 is damaged (") and words in warning
+
+
+def test_a_renamed_checkpoint_is_not_taken_for_another(saved, tmp_path):
+    folder = shutil.copytree(saved, tmp_path / "checkpoints")
+    newest(folder).rename(folder / "step_000000003000")
+    found = restore(folder)
+    assert found.step == 1000
+    assert found.warnings == ("checkpoint at step 3,000 is damaged (it is of step 2,000) and is not used",)
+    newest(folder).rename(folder / "step_3000")  # no name of ours
+    assert checkpoint.latest_step(folder) == 1000
+
+
+def test_orbax_is_silent_and_others_are_not(tmp_path, monkeypatch, caplog):
+    """After an error its threads, tasks and writes go on for a while."""
+    heard = []
+    monkeypatch.setattr(sys, "unraisablehook", heard.append)
+    checkpoint._quiet_orbax.cache_clear()
+    save(tmp_path, 1)
+    for error in (RuntimeError("Event loop is closed"), RuntimeError("something else")):
+        sys.unraisablehook(types.SimpleNamespace(exc_value=error))
+    assert [str(raised.exc_value) for raised in heard] == ["something else"]
+    for logger, told in (("asyncio", "Task exception was never retrieved: orbax/checkpoint"), ("asyncio", "mine")):
+        logging.getLogger(logger).error(told)
+    assert caplog.messages == ["mine"]
 
 
 def test_all_damaged(saved, tmp_path):

@@ -12,7 +12,7 @@ import pytest
 
 from suite.records import tables
 from suite.records.event_files import EventFile
-from suite.records.record import RunRecord, disk_full_is_an_error, require_writable, run_folder
+from suite.records.record import RunRecord, refused_writes_are_errors, require_writable, run_folder
 from suite.records.tables import CsvTable, cell, write_whole
 from suite.registry import resolve
 from suite.runtime.errors import RunError, UserError
@@ -28,7 +28,7 @@ def play(record, steps):
         value = float(np.float32(step) / 3)
         episode = {"step": step, "return": value, "length": step, "achievement_return": 1.0, "health_return": value}
         record.append_episodes([episode | {"arrive": step % 2}])
-        metrics = {"step": step, "return": None if step % 2 else value}
+        metrics = {"step": step, "episodes": 1, "return": None if step % 2 else value}
         record.append_metrics(metrics | ({"imagine/loss": value} if step > 20 else {}), ["imagine/loss"])
         record.append_timing({"step": step, "collect": 0.1})
 
@@ -111,6 +111,41 @@ def test_a_row_cut_off_by_a_kill(tmp_path):
     with RunRecord.open(record.folder, CONFIG) as record:
         assert record.rewind(20) == 2
     assert contents(record.folder) == whole
+
+
+def test_an_evaluation_that_is_killed_leaves_all_of_its_rows_or_none(tmp_path, monkeypatch):
+    row = {"step": 20, "return": 1.0, "length": 3, "achievement_return": 1.0, "health_return": 0.0, "arrive": 1}
+    with create(tmp_path) as record:
+        record.append_evaluation([row])
+        with (record.folder / "evaluations.csv").open("ab") as file:
+            file.write(b"20,1")  # as earlier versions left it
+        before = (record.folder / "evaluations.csv").read_bytes()
+        with full_disk(monkeypatch), pytest.raises(OSError):
+            record.append_evaluation([row, row])
+        assert (record.folder / "evaluations.csv").read_bytes() == before
+        record.append_evaluation([row, row])
+        assert record.table("evaluations")["return"].tolist() == [1.0] * 3
+        assert record.has_evaluation(20, 3) and not record.has_evaluation(20, 4) and not record.has_evaluation(2, 1)
+
+
+def test_an_episode_that_ends_with_a_move_of_chance_is_not_kept_twice(tmp_path):
+    """Such a move is no step: the first one after a checkpoint has the checkpoint's step."""
+    with create(tmp_path) as record:
+        play(record, [10, 20])
+        row = {"step": 20, "return": 1.0, "length": 3, "achievement_return": 1.0, "health_return": 0.0, "arrive": 1}
+        record.append_episodes([row])
+    with RunRecord.open(record.folder, CONFIG) as record:
+        assert record.rewind(20) == 1
+        assert record.episodes()["step"].tolist() == [10, 20]
+
+
+def test_a_run_that_goes_on_reads_whole_rows_only(tmp_path):
+    with create(tmp_path) as record:
+        assert record.table("metrics").empty and record.episodes().empty
+        play(record, [10])
+        with (record.folder / "metrics.csv").open("ab") as file:
+            file.write(b"20,0.")
+        assert record.table("metrics")["step"].tolist() == [10]
 
 
 def test_appending_after_a_cut_off_row_or_header(tmp_path):
@@ -270,7 +305,7 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch):
         play(record, [10])
         before = contents(record.folder)
         intact = pytest.raises(RunError, match=r"^disk full; the last checkpoint is intact")
-        with full_disk(monkeypatch), intact, disk_full_is_an_error():
+        with full_disk(monkeypatch), intact, refused_writes_are_errors():
             play(record, [20])
         assert contents(record.folder) == before
         with full_disk(monkeypatch), pytest.raises(OSError):
@@ -287,9 +322,11 @@ def test_errors_that_quote_or_wrap_a_full_disk():
         (ValueError("RESOURCE_EXHAUSTED: write: No space left on device"), True),
         (full, True),
         (OSError(errno.EDQUOT, "quota"), True),
+        (OSError(errno.EROFS, "read-only"), True),
+        (ValueError("INTERNAL: Error writing x: Input/output error"), True),
         (OSError(errno.EACCES, "no"), False),
     ]:
-        with pytest.raises(RunError if told else RuntimeError), disk_full_is_an_error():
+        with pytest.raises(RunError if told else RuntimeError), refused_writes_are_errors():
             raise RuntimeError("wrapped") from cause
 
 

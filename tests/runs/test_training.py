@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -13,8 +14,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from leaderboards.results import finished_in
 from suite import registry
 from suite.agent.phases import Agent
+from suite.records import checkpoint
 from suite.records.record import RunRecord
 from suite.runs import evaluation, training
 from suite.runs.saved_model import restore
@@ -150,6 +153,124 @@ def test_a_finished_run_is_not_run_again(uninterrupted):
     assert again.status == "already finished"
     assert again.scores == uninterrupted.scores
     assert files(uninterrupted.folder) == before
+
+
+@pytest.fixture
+def copied(tmp_path, uninterrupted):
+    """A finished run to damage, and the call that it was made by."""
+    folder = tmp_path / uninterrupted.folder.relative_to(uninterrupted.folder.parents[3])
+    shutil.copytree(uninterrupted.folder, folder)
+    return folder, lambda: training.run(config(), tmp_path, QuietReporter())
+
+
+def put_status(folder: Path, status: str) -> None:
+    path = folder / "record.json"
+    path.write_text(path.read_text().replace('"status": "finished"', f'"status": "{status}"'))
+
+
+def test_a_run_killed_before_it_says_that_it_is_finished(copied, uninterrupted):
+    """What only going on needs is dropped by then."""
+    folder, again = copied
+    put_status(folder, "running")
+    assert_same(again(), uninterrupted)
+    put_status(folder, "done")
+    with pytest.raises(UserError, match=r"record.json is damaged: status='done': input should be 'running', "):
+        again()
+
+
+def test_a_run_killed_while_it_ends_keeps_nothing_that_only_going_on_needs(tmp_path, uninterrupted, monkeypatch):
+    def killed(*args):
+        raise Killed
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(RunRecord, "finish", killed)
+        training.run(config(), tmp_path, QuietReporter())
+    result = training.run(config(), tmp_path, QuietReporter())
+    assert_same(result, uninterrupted)
+    assert [path.name for path in (result.folder / "checkpoints").iterdir()] == ["step_000000000192"]
+    assert not any((result.folder / "checkpoints").glob("*/resume"))
+
+
+def test_a_final_evaluation_of_which_rows_are_missing_is_played_again(copied, uninterrupted):
+    folder, again = copied
+    put_status(folder, "running")
+    header, *rows = (folder / "evaluations.csv").read_bytes().splitlines(keepends=True)
+    (folder / "evaluations.csv").write_bytes(header + b"".join(rows[:2]) + rows[2][:3])
+    assert_same(again(), uninterrupted)
+    kept = sorted((folder / "replaced").glob("*/evaluations.csv"))
+    assert b"".join(path.read_bytes().removeprefix(header) for path in kept) == rows[2][:3] + b"".join(rows[:2])
+
+
+def change(name: str, old: bytes, new: bytes):
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes().replace(old, new, 1))
+
+
+def cut(name: str, end: int):
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:end])
+
+
+def a_row_less(folder: Path) -> None:
+    (folder / "episodes.csv").write_bytes((folder / "episodes.csv").read_bytes()[:-2].rpartition(b"\n")[0] + b"\n")
+
+
+DAMAGE = {
+    "deleted": (lambda folder: (folder / "episodes.csv").unlink(), "episodes.csv is missing"),
+    "emptied": (cut("episodes.csv", 0), "episodes.csv is cut off in line 1"),
+    "truncated": (cut("episodes.csv", -3), "episodes.csv is cut off in line "),
+    "a row less": (a_row_less, " episodes, metrics.csv counted "),
+    "nan": (change("episodes.csv", b",1.0,", b",nan,"), " is nan, not a finite number"),
+    "another header": (
+        change("episodes.csv", b"length", b"duration"),
+        "episodes.csv has columns step, return, duration",
+    ),
+    "torn evaluation": (cut("evaluations.csv", -3), "evaluations.csv is cut off in line 5"),
+    "no metrics": (lambda folder: (folder / "metrics.csv").unlink(), "metrics.csv is missing"),
+    "an iteration less": (cut("metrics.csv", -1), "metrics.csv is cut off in line 7"),
+    "another configuration": (
+        change("config.json", b'"discount": 0.9', b'"discount": 0.8'),
+        "configuration that was run",
+    ),
+    "another seed": (change("record.json", b'"seed": 0', b'"seed": 1'), "record.json says seed=1, config.json 0"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_what_is_wrong_with_a_finished_run_is_said_and_nothing_is_put_in_its_place(copied, name):
+    folder, again = copied
+    damage, message = DAMAGE[name]
+    damage(folder)
+    before = {path: path.read_bytes() for path in folder.glob("*.csv")}
+    with pytest.raises(UserError, match=re.escape(message)):
+        again()
+    with pytest.raises(UserError, match=re.escape(message)):
+        (record,) = finished_in([folder])
+        record.episodes(), record.table("evaluations")
+    assert {path: path.read_bytes() for path in folder.glob("*.csv")} == before
+
+
+def test_a_run_does_not_go_on_without_the_rows_before_its_checkpoint(tmp_path):
+    with pytest.raises(Killed):
+        training.run(config(), tmp_path, KillAt("collect", 4))
+    (folder,) = tmp_path.glob("*/*/*/seed_0")
+    (folder / "episodes.csv").unlink()
+    before = (folder / "metrics.csv").read_bytes()
+    with pytest.raises(UserError, match=r"episodes.csv has 0 episodes, metrics.csv counted \d+"):
+        training.run(config(), tmp_path, QuietReporter())
+    assert (folder / "metrics.csv").read_bytes() == before and not (folder / "episodes.csv").exists()
+
+
+def test_a_second_signal_waits_for_the_checkpoint_that_is_being_written(tmp_path, monkeypatch):
+    save = checkpoint._save_tree
+
+    def interrupted(*args):
+        os.kill(os.getpid(), signal.SIGINT)
+        save(*args)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(checkpoint, "_save_tree", interrupted)
+        training.run(config(), tmp_path, QuietReporter())
+    (folder,) = tmp_path.glob("*/*/*/seed_0")
+    assert checkpoint.latest_step(folder / "checkpoints") == 64
 
 
 def test_records_are_complete(uninterrupted):
