@@ -196,7 +196,7 @@ def test_what_cannot_be_filmed(suite, tmp_path):
     for task, agent, words, message in (
         ("openspiel/leduc", "mfrl", (), "shows symbols and no frames to film"),
         (TASK, "mfrl", ("--dream",), "has no world model to dream with: mfrl"),
-        (TASK, "m5", ("--steps", "1"), "--steps=1: must be at least 2"),
+        (TASK, "m5", ("--steps", "1"), "argument --steps: '1' is no whole number from 2 to 2,147,483,647"),
     ):
         config = registry.resolve(task, agent, "smoke")
         with RunRecord.create(run_folder(tmp_path, config), config, registry.task(task).spec()) as record:

@@ -6,22 +6,19 @@ import argparse
 import dataclasses
 from pathlib import Path
 
+from suite.commands.configuration import whole
 from suite.commands.printing import print_json
-from suite.runtime.errors import UserError
 
 SUMMARY = "finished runs: scores and curves, mean and standard error over seeds, as Markdown tables"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="runs in or below it are compared")
-    parser.add_argument("--parts", type=int, default=5, metavar="N", help="points of a curve (default 5)")
+    parser.add_argument("--parts", type=whole(1, 10_000), default=5, metavar="N", help="points of a curve (default 5)")
     parser.add_argument("--score", metavar="S", help="what curves are of (default: return, or the first score)")
 
 
 def execute(args: argparse.Namespace) -> int:
-    if args.parts < 1:
-        raise UserError(f"--parts={args.parts}: must be at least 1")
-
     from leaderboards.compare import compare, tables
     from leaderboards.results import finished_in
 

@@ -1,9 +1,13 @@
-"""The options with which commands name a configuration: task, agent, preset, steps, single fields."""
+"""The options with which commands name a configuration: task, agent, preset, steps, single fields, and numbers."""
 
 from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Callable
+
+MOST = 2**31 - 1  # of what is counted: arrays are indexed by 32 bits
+SEEDS = 10_000  # in one command
 
 
 def add_configuration(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +23,17 @@ def add_configuration(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def whole(least: int, most: int = MOST) -> Callable[[str], int]:
+    """The type of an option that is a whole number of this range."""
+
+    def parse(text: str) -> int:
+        if not re.fullmatch("[+-]?[0-9]{1,30}", text) or not least <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text!r} is no whole number from {least:,} to {most:,}")
+        return int(text)
+
+    return parse
+
+
 def parse_seeds(text: str) -> list[int]:
     """Seeds of "0-2" or "0,3,5", or of both mixed."""
     seeds: list[int] = []
@@ -27,5 +42,7 @@ def parse_seeds(text: str) -> list[int]:
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (0, -1)
         if last < first:
             raise argparse.ArgumentTypeError(f"{text!r} is not of the form 0-2 or 0,3,5")
+        if len(seeds) + last - first >= SEEDS:
+            raise argparse.ArgumentTypeError(f"{text!r} are more than {SEEDS:,} seeds")
         seeds += range(first, last + 1)
     return list(dict.fromkeys(seeds))

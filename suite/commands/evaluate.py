@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from suite.commands.configuration import whole
 from suite.commands.printing import make_reporter, print_json, print_scores
 from suite.runtime.errors import UserError
 
@@ -14,7 +15,7 @@ SUMMARY = "play whole episodes with a run's newest checkpoint"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("what", metavar="RUN_DIR|TASK", help="a run's folder, or with --policy a task")
     parser.add_argument("--policy", metavar="module:Class", help="somebody else's policy")
-    parser.add_argument("--episodes", type=int, metavar="N", help="at least so many")
+    parser.add_argument("--episodes", type=whole(1), metavar="N", help="at least so many")
     parser.add_argument("--quiet", action="store_true", help="no progress")
 
 
@@ -22,8 +23,6 @@ def execute(args: argparse.Namespace) -> int:
     from suite import registry
     from suite.records.record import RunRecord
 
-    if args.episodes is not None and args.episodes < 1:
-        raise UserError(f"--episodes={args.episodes}: must be at least 1")
     if args.policy:
         from suite.runs.external import evaluate_policy
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from suite.commands.configuration import whole
 from suite.commands.printing import format_value, make_reporter, print_json, print_table
 from suite.interface.scores import ScoreName
-from suite.runtime.errors import UserError
 
 SUMMARY = "how good world models are: rollouts beside reality; of games, whether they keep the rules"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folders", nargs="+", type=Path, metavar="RUN_DIR", help="a run's folder")
-    parser.add_argument("--games", type=int, default=1000, metavar="N", help="games to imagine (default 1000)")
+    parser.add_argument(
+        "--games", type=whole(1, 1_000_000), default=1000, metavar="N", help="games to imagine (default 1000)"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to (default: inspect, where the runs are)")
     parser.add_argument("--quiet", action="store_true", help="no progress")
 
@@ -22,8 +24,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def execute(args: argparse.Namespace) -> int:
     from suite.records.record import RunRecord
 
-    if args.games < 1:
-        raise UserError(f"--games={args.games}: must be at least 1")
     records = [RunRecord.open(folder, lock=False) for folder in args.folders]
     return _inspect_games(args) if all(record.spec.two_player for record in records) else _inspect_rollouts(args)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from suite.commands.configuration import parse_seeds
+from suite.commands.configuration import parse_seeds, whole
 from suite.commands.printing import print_json, print_table, score_line
 from suite.runtime.errors import UserError
 
@@ -35,13 +35,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", type=int, metavar="N", help="real environment steps (default: the preset's)")
     parser.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where records go (default runs)")
     parser.add_argument(
-        "--jobs", type=int, metavar="N", help="runs at once (default: 1 for two CPU cores; 1 on a GPU; Ray: what fits)"
+        "--jobs",
+        type=whole(1),
+        metavar="N",
+        help="runs at once (default: 1 for two CPU cores; 1 on a GPU; Ray: what fits)",
     )
     parser.add_argument("--engine", choices=("local", "ray"), default="local", help="this machine (default), or Ray")
     parser.add_argument("--address", metavar="A", help="Ray's (default: RAY_ADDRESS, or Ray is started here)")
     parser.add_argument("--gpus", type=float, metavar="X", help="Ray: GPUs for each run (default 0: CPUs only)")
     parser.add_argument(
-        "--retries", type=int, metavar="N", help="of a run that failed or died (default: 2 if it died, else 0)"
+        "--retries", type=whole(0), metavar="N", help="of a run that failed or died (default: 2 if it died, else 0)"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress")
     parser.add_argument(
@@ -50,10 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    for option, least in (("jobs", 1), ("gpus", 0), ("retries", 0)):
-        value = getattr(args, option)
-        if value is not None and not value >= least:
-            raise UserError(f"--{option}={value:g}: must be at least {least}")
+    if args.gpus is not None and not args.gpus >= 0:
+        raise UserError(f"--gpus={args.gpus:g}: must be at least 0")
     if args.gpus and args.gpus > 1 and args.gpus % 1:
         raise UserError(f"--gpus={args.gpus:g}: Ray gives a part of one, or whole ones")
     on_ray = args.engine == "ray"

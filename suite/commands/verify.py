@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from suite.commands.configuration import whole
 from suite.commands.printing import make_reporter, print_json
 from suite.runtime.errors import UserError
 
@@ -16,14 +17,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="DIR", help="where `suite publish` wrote them")
     parser.add_argument("--replay", action="store_true", help="also run each run's first iteration again, and compare")
     parser.add_argument("--quiet", action="store_true", help="no progress")
-    parser.add_argument("--runs", type=int, metavar="K", help="with --replay: only K of the runs, drawn at random")
+    parser.add_argument("--runs", type=whole(1), metavar="K", help="with --replay: only K of the runs, drawn at random")
 
 
 def execute(args: argparse.Namespace) -> int:
     from leaderboards.verification import verify
 
-    if args.runs is not None and (args.runs < 1 or not args.replay):
-        raise UserError("--runs needs --replay, and a number above 0")
+    if args.runs is not None and not args.replay:
+        raise UserError("--runs needs --replay")
     problems = verify(args.folder)
     for problem in problems:
         print(problem)

@@ -21,8 +21,8 @@ from pydantic.dataclasses import dataclass
 PATCH_THRESHOLD = 0.75
 
 T = TypeVar("T")
-Positive = Annotated[int, Field(gt=0)]
-NotNegative = Annotated[int, Field(ge=0)]
+Positive = Annotated[int, Field(gt=0, lt=2**31)]  # what is counted, JAX counts in 32 bits
+NotNegative = Annotated[int, Field(ge=0, lt=2**31)]
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
@@ -216,7 +216,7 @@ class CheckpointConfig:
     """How often a run saves itself. Not part of the protocol."""
 
     every_steps: Positive = 50_000
-    keep: Annotated[int, Field(ge=2)] = 2  # two, so that one may be found broken
+    keep: Annotated[int, Field(ge=2, lt=2**31)] = 2  # two, so that one may be found broken
 
 
 @config_class

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
+import inspect
 import sys
+import traceback
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +29,7 @@ from suite.runtime.errors import UserError, did_you_mean
 from suite.runtime.reporting import Reporter
 
 NUM_ENVS, EVENTS = 48, 32  # side by side, and between two looks at who is done
+METHOD = "preferences(observation, first, acting)"
 GAMES = 1_000  # episodes of a two-player game, which are short and whose returns scatter
 
 
@@ -36,12 +41,29 @@ class ExternalPolicy:
 
     def ask(self, observation_B: np.ndarray, first_B: np.ndarray, acting_B: np.ndarray) -> np.ndarray:
         """The user's preferences, float32 [B, A]; raises UserError if they are none."""
-        scores = np.asarray(self.policy.preferences(observation_B, first_B, acting_B), np.float32)
+        with _raised(f"{METHOD} of {type(self.policy).__name__}"):
+            given = np.asarray(self.policy.preferences(observation_B, first_B, acting_B))
         expected = (len(observation_B), self.spec.num_actions)
-        if scores.shape != expected or np.isnan(scores).any():
-            gave = "nan" if scores.shape == expected else f"shape {list(scores.shape)}"
-            raise UserError(f"preferences(...) gave {gave}, expected numbers of shape {list(expected)}")
-        return np.maximum(scores, -1e8)  # an action's -inf; what is illegal is further below
+        gave = ""
+        if given.shape != expected:
+            gave = f"shape {list(given.shape)}"
+        elif given.dtype.kind in "USOMmc":
+            gave = f"values of type {given.dtype}"
+        else:
+            with np.errstate(over="ignore"):
+                given = given.astype(np.float32)
+            if np.isnan(given).any():
+                gave = "nan"
+            elif (given == np.inf).any():
+                gave = "inf"
+            elif (given == -np.inf).all(-1)[acting_B].any():
+                gave = "-inf for every action"
+        if gave:
+            raise UserError(
+                f"{METHOD} of {type(self.policy).__name__} gave {gave}, expected numbers of shape {list(expected)}, "
+                "-inf for an action that is never to be taken"
+            )
+        return np.maximum(given, -1e8)  # an action's -inf; what is illegal is further below
 
     def initial_hidden(self, batch: int) -> jax.Array:
         """float32 [batch, 0]: what it remembers is its own affair."""
@@ -118,14 +140,49 @@ def _load(reference: str, spec: EnvironmentSpec) -> Any:
         raise UserError(f"--policy={reference}: expected module:Class")
     sys.path.insert(0, str(Path.cwd()))
     try:
-        imported = importlib.import_module(module)
-    except ImportError as error:
-        raise UserError(f"--policy={reference}: cannot import {module!r}: {error}") from error
+        with _raised(f"--policy={reference}: importing {module!r}"):
+            imported = importlib.import_module(module)
     finally:
         sys.path.pop(0)
     if not hasattr(imported, name):
         raise UserError(f"--policy={reference}: {module} has no {name!r}; {did_you_mean(name, vars(imported))}")
-    policy = getattr(imported, name)(spec)
-    if not callable(getattr(policy, "preferences", None)):
-        raise UserError(f"--policy={reference}: it has no method preferences(observation, first, acting)")
+    made = getattr(imported, name)
+    if not callable(made) or not _takes(made, 1):
+        raise UserError(f"--policy={reference}: {name}{_signature(made)} cannot be called as {name}(spec)")
+    with _raised(f"--policy={reference}: {name}(spec)"):
+        policy = made(spec)
+    method = getattr(policy, "preferences", None)
+    if not callable(method):
+        raise UserError(f"--policy={reference}: it has no method {METHOD}")
+    if not _takes(method, 3):
+        raise UserError(f"--policy={reference}: its method preferences{_signature(method)} is called as {METHOD}")
     return policy
+
+
+def _takes(function: Callable[..., Any], arguments: int) -> bool:
+    """Whether it can be called with so many arguments, as far as it tells."""
+    try:
+        inspect.signature(function).bind(*range(arguments))
+    except TypeError:
+        return False
+    except ValueError:  # one of a compiled language
+        return True
+    return True
+
+
+def _signature(function: Any) -> str:
+    try:
+        return str(inspect.signature(function))
+    except (TypeError, ValueError):
+        return ""
+
+
+@contextlib.contextmanager
+def _raised(what: str) -> Iterator[None]:
+    """Says in one line what somebody else's code raised, and where."""
+    try:
+        yield
+    except Exception as error:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        problem = " ".join(f"{type(error).__name__}: {error}".split())
+        raise UserError(f"{what} raised {problem} ({Path(where.filename).name}, line {where.lineno})") from error

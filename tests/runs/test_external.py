@@ -60,6 +60,51 @@ class Nan(Uniform):
         return np.full((len(observation), 2), np.nan)
 
 
+class Other(Uniform):
+    """Gives what it is made with."""
+
+    gives: object = 0.0
+
+    def preferences(self, observation, first, acting):
+        return np.full((len(observation), self.spec.num_actions), self.gives)
+
+
+class Infinite(Other):
+    gives = np.inf
+
+
+class Large(Other):
+    gives = 1e300
+
+
+class Never(Other):
+    gives = -np.inf
+
+
+class Text(Other):
+    gives = "left"
+
+
+class Ragged(Uniform):
+    def preferences(self, observation, first, acting):
+        return [[0.0], [0.0, 1.0]]
+
+
+class Few(Uniform):
+    def preferences(self, observation):
+        return np.zeros((len(observation), 2))
+
+
+class Unmade:
+    def __init__(self):
+        pass
+
+
+class Failing(Uniform):
+    def preferences(self, observation, first, acting):
+        return {}["moves"]
+
+
 class Mute:
     def __init__(self, spec):
         pass
@@ -85,6 +130,15 @@ def test_a_policy_may_remember():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
+        ("Infinite", "preferences(observation, first, acting) of Infinite gave inf, expected numbers of shape [48, 2]"),
+        ("Large", "of Large gave inf, expected numbers"),
+        ("Never", "of Never gave -inf for every action, expected numbers"),
+        ("Text", "of Text gave values of type <U4, expected numbers"),
+        ("Ragged", "preferences(observation, first, acting) of Ragged raised ValueError: "),
+        ("Few", "its method preferences(observation) is called as preferences(observation, first, acting)"),
+        ("Unmade", "Unmade() cannot be called as Unmade(spec)"),
+        ("CORRIDOR", "cannot be called as CORRIDOR(spec)"),
+        ("Failing", "of Failing raised KeyError: 'moves' (test_external.py, line "),
         ("Wrong", "gave shape [48, 1], expected numbers of shape [48, 2]"),
         ("Nan", "gave nan, expected numbers of shape [48, 2]"),
         ("Mute", "it has no method preferences(observation, first, acting)"),
