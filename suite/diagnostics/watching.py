@@ -17,7 +17,7 @@ from suite.diagnostics.filmstrips import Strip, film
 from suite.interface.environment import EnvironmentSpec
 from suite.interface.tokens import TokenizerState
 from suite.policy.ppo import PolicyTrainState
-from suite.records.record import RunRecord
+from suite.records.record import RunRecord, require_writable
 from suite.runs.saved_model import restore
 from suite.runtime.errors import UserError
 from suite.runtime.reporting import Reporter
@@ -72,6 +72,8 @@ def watch(
             raise UserError(f"{folder} is a run of {spec.id}, which shows symbols and no frames to film")
         if dream and not record.config.world_model.enabled:
             raise UserError(f"{folder} has no world model to dream with: {record.config.agent}")
+        path = out or folder / "watch.gif"
+        require_writable(path.parent)
         run = restore(record, reporter)
     key = jax.random.fold_in(evaluation_key(seed, run.step), 2)
     played = play(run.agent, run.model.policy_state, key, episodes, steps)
@@ -85,7 +87,6 @@ def watch(
         imagined["expected"] = np.concatenate(shown)[1:]
     notes = [note for number, episode in enumerate(played) for note in captions(episode, spec, number + 1)]
     patch = run.agent.tokenizer.patch if dream and hasattr(run.agent.tokenizer, "patch") else spec.observation.patch
-    path = out or folder / "watch.gif"
     film(path, Strip(name, frames, imagined, notes, patch or (1, 1), spec.observation.high), SECONDS)
     return path, played
 

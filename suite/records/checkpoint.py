@@ -158,7 +158,7 @@ def _quiet_orbax() -> None:
     The error itself is raised here, too: once is enough.
     """
     logging.getLogger("absl").addFilter(lambda record: "orbax" not in record.pathname)
-    logging.getLogger("asyncio").addFilter(lambda record: "orbax" not in record.getMessage())
+    logging.getLogger("asyncio").addFilter(lambda record: "orbax" not in logging.Formatter().format(record))
     hook = sys.unraisablehook
 
     def heard(raised: sys.UnraisableHookArgs) -> None:

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import errno
 import fcntl
 import os
 import platform
@@ -44,7 +43,6 @@ if TYPE_CHECKING:
     from suite.interface.environment import EnvironmentSpec
 
 LOCK = "run.lock"
-FULL, BROKEN = (errno.ENOSPC, errno.EDQUOT), (errno.EROFS, errno.EIO, errno.EFBIG, errno.ESTALE)
 
 
 def run_folder(out: Path, config: Config) -> Path:
@@ -63,32 +61,6 @@ def require_writable(folder: Path, option: str = "--out") -> None:
         tempfile.TemporaryFile(dir=folder).close()  # has no name that a kill could leave behind
     except OSError as error:
         raise UserError(f"cannot write to {folder}: {error.strerror}; choose another {option}") from error
-
-
-@contextlib.contextmanager
-def refused_writes_are_errors() -> Iterator[None]:
-    """Turns what a full or broken disk refuses, wherever inside it is noticed, into a `RunError`."""
-    try:
-        yield
-    except RunError:
-        raise
-    except Exception as error:
-        reason = _refused_write(error)
-        if reason is None:
-            raise
-        what = "disk full" if reason in FULL else f"cannot write: {os.strerror(reason)}"
-        remedy = "free some space" if reason in FULL else "see to the disk"
-        raise RunError(f"{what}; the last checkpoint is intact: {remedy} and run the same command again") from error
-
-
-def _refused_write(error: BaseException | None) -> int | None:
-    """The system's number for why it refused to write, also where a library wraps its error or only quotes it."""
-    while error is not None:
-        for number in (*FULL, *BROKEN):
-            if (isinstance(error, OSError) and error.errno == number) or os.strerror(number) in str(error):
-                return number
-        error = error.__cause__ or error.__context__
-    return None
 
 
 def protocol(config: Config, spec: EnvironmentSpec) -> ProtocolFields:
@@ -139,43 +111,43 @@ class RunRecord:
         """
         require_writable(folder)
         lock = _acquire(folder)
-        taken = [path for path in (folder / "record.json", *folder.glob("*.csv")) if path.exists()]
-        if taken:
-            lock.close()
-            raise UserError(f"{folder} already holds {taken[0].name}; choose another --out")
-        rules = protocol(config, spec)
-        fields = RecordFields(
-            schema=SCHEMA,
-            task=config.task,
-            agent=config.agent,
-            preset=config.preset,
-            seed=config.seed,
-            config_digest=config.digest(),
-            protocol=rules,
-            protocol_hash=rules.hash,
-            max_return=spec.max_return,
-            achievements=list(spec.achievements),
-            columns={
-                "episodes": episode_columns(spec),
-                "evaluations": episode_columns(spec),
-                "metrics": None,  # those of the first row
-                "timing": None,
-            },
-            status="running",
-            steps=0,
-            started=_now(),
-            ended=None,
-            wall_clock_seconds={"total": 0.0},
-            peak_memory_bytes={},
-            **provenance(),
-            resumed=[],
-        )
-        write_json(folder / "config.json", config.as_dict())
-        fields.write(folder)  # last: a folder is a run from here on
-        record = cls(folder, config, fields, spec, lock)
-        record._new = True
-        record._begin_tables()
-        return record
+        with _closed_on_error(lock):
+            taken = [path for path in (folder / "record.json", *folder.glob("*.csv")) if path.exists()]
+            if taken:
+                raise UserError(f"{folder} already holds {taken[0].name}; choose another --out")
+            rules = protocol(config, spec)
+            fields = RecordFields(
+                schema=SCHEMA,
+                task=config.task,
+                agent=config.agent,
+                preset=config.preset,
+                seed=config.seed,
+                config_digest=config.digest(),
+                protocol=rules,
+                protocol_hash=rules.hash,
+                max_return=spec.max_return,
+                achievements=list(spec.achievements),
+                columns={
+                    "episodes": episode_columns(spec),
+                    "evaluations": episode_columns(spec),
+                    "metrics": None,  # those of the first row
+                    "timing": None,
+                },
+                status="running",
+                steps=0,
+                started=_now(),
+                ended=None,
+                wall_clock_seconds={"total": 0.0},
+                peak_memory_bytes={},
+                **provenance(),
+                resumed=[],
+            )
+            write_json(folder / "config.json", config.as_dict())
+            fields.write(folder)  # last: a folder is a run from here on
+            record = cls(folder, config, fields, spec, lock)
+            record._new = True
+            record._begin_tables()
+            return record
 
     @classmethod
     def open(
@@ -194,7 +166,7 @@ class RunRecord:
         """
         RecordFields.read(folder)  # nothing, not even a lock, is written into a folder that holds no run
         held = _acquire(folder) if lock else None
-        try:
+        with _closed_on_error(held):
             fields = RecordFields.read(folder)
             stored = _read_config(folder, fields)
             if config is not None:
@@ -202,10 +174,6 @@ class RunRecord:
             if config is not None and spec is not None:
                 _require_same_rules(folder, fields.protocol, protocol(config, spec))
             return cls(folder, config or stored, fields, spec, held)
-        except BaseException:
-            if held is not None:
-                held.close()
-            raise
 
     @classmethod
     def open_or_create(cls, folder: Path, config: Config, spec: EnvironmentSpec) -> RunRecord:
@@ -377,12 +345,13 @@ class RunRecord:
 
     def close(self) -> None:
         """Lets other processes open the folder."""
-        if self._events is not None:
-            self._events.close()
-            self._events = None
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
+        events, lock, self._events, self._lock = self._events, self._lock, None, None
+        try:
+            if events is not None:
+                events.close()
+        finally:
+            if lock is not None:
+                lock.close()
 
     def __enter__(self) -> RunRecord:
         return self
@@ -404,10 +373,22 @@ def _acquire(folder: Path) -> IO[str]:
         owner = file.read().strip()
         file.close()
         raise FolderInUseError(f"{folder} is in use by another process ({owner or 'just started'})") from None
-    file.truncate(0)
-    file.write(f"pid {os.getpid()} on {platform.node()}")
-    file.flush()
+    with _closed_on_error(file):
+        file.truncate(0)
+        file.write(f"pid {os.getpid()} on {platform.node()}")
+        file.flush()
     return file
+
+
+@contextlib.contextmanager
+def _closed_on_error(lock: IO[str] | None) -> Iterator[None]:
+    try:
+        yield
+    except BaseException:
+        if lock is not None:
+            with contextlib.suppress(OSError):  # of a full disk, which it was about
+                lock.close()
+        raise
 
 
 def _require_same_run(folder: Path, stored: Config, asked: Config) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import errno
+import os
 import re
 from collections.abc import Iterable, Iterator
 
@@ -48,3 +50,33 @@ def host_errors() -> Iterator[None]:
         if quoted is None:
             raise
         raise {"UserError": UserError, "RunError": RunError}[quoted[1]](quoted[2]) from error
+
+
+FULL, BROKEN = (errno.ENOSPC, errno.EDQUOT), (errno.EROFS, errno.EIO, errno.EFBIG, errno.ESTALE)
+
+
+@contextlib.contextmanager
+def refused_writes_are_errors() -> Iterator[None]:
+    """Turns what a full, broken or read-only disk refuses, wherever inside it is noticed, into a `RunError`."""
+    try:
+        yield
+    except (UserError, RunError, BrokenPipeError):
+        raise
+    except Exception as error:
+        if problem := _refused(error):
+            raise RunError(f"{problem}; what was saved is intact: run the same command again afterwards") from error
+        raise
+
+
+def _refused(error: BaseException | None) -> str:
+    """What the system refused and what to do, also where a library wraps its error or only quotes it; "" if nothing."""
+    while error is not None:
+        if any(getattr(error, "errno", None) == number or os.strerror(number) in str(error) for number in FULL):
+            return "disk full: free some space"
+        for number in BROKEN:
+            if getattr(error, "errno", None) == number or os.strerror(number) in str(error):
+                return f"{os.strerror(number)}: see to the disk"
+        if isinstance(error, PermissionError):
+            return f"{error.strerror}, {error.filename}: see to its permissions"
+        error = error.__cause__ or error.__context__
+    return ""

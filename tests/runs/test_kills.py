@@ -1,4 +1,5 @@
-"""Runs, sweeps and `suite publish`, killed at random instants: nothing is lost, and what they come to is the same.
+"""Runs, sweeps and `suite publish`, killed at random instants or out of disk: nothing is lost, and what they come to is
+the same.
 
 It takes a quarter of an hour and more, so that only `pytest -m kills` runs it. KILLS is how many kills there are of
 each kind (default 7), SEED is of when they come (default 0).
@@ -9,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +19,7 @@ from pathlib import Path
 
 import pytest
 
+from suite import cli
 from suite.records import record
 from tests.leaderboards import test_publish as published
 from tests.runs.sweeping import alive, owner
@@ -90,9 +93,12 @@ def test_runs(family):
     finish(*words, "whole")
     (whole,) = Path("whole").rglob("seed_0")
     iterations = len(lines(whole / "metrics.csv"))
-    seconds = finish(*words, "warm") / iterations  # nothing is compiled any more
+    finish(*words, "warm")  # nothing is compiled any more
+    (warm,) = Path("warm").rglob("seed_0")
+    took = json.loads((warm / "record.json").read_text())["wall_clock_seconds"]
+    seconds = (took["total"] - took["start"]) / iterations
     expected = state([whole])
-    assert state(Path("warm").rglob("seed_0")) == expected
+    assert state([warm]) == expected
     draw = random.Random(f"{SEED} {family}")
     for number in range(KILLS):
         out = f"killed_{number}"
@@ -155,3 +161,88 @@ def test_publish(monkeypatch):
         finish(*words, str(out), "--page", str(out))
         assert tree(out) == expected, f"publish, kill {number}: {files} files and {delay:.3f} seconds"
         finish("verify", str(out))
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A disk of 3 MiB, and how to fill it up to so many free bytes (None: empty it) or to make it read-only."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", folder], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip("needs to mount a disk")
+
+    def fill(free):
+        (folder / "filling").unlink(missing_ok=True)
+        if free is not None:
+            found = os.statvfs(folder)
+            (folder / "filling").write_bytes(bytes(max(found.f_bavail * found.f_bsize - free, 0)))
+
+    def read_only():
+        subprocess.run(["mount", "-o", "remount,ro", folder], check=True)
+
+    yield folder, fill, read_only
+    subprocess.run(["umount", folder], check=True)
+
+
+def one_line(words, capfd):
+    """The command's exit code, and what it says on stderr, wherever in the process that is written."""
+    code = cli.main(list(map(str, words)))
+    said = capfd.readouterr().err.splitlines()
+    assert len(said) == (code != 0), "\n".join(said)
+    return code, "".join(said)
+
+
+def test_a_full_disk(disk, capfd):
+    folder, fill, _ = disk
+    words = ("run", "minatar/breakout", "--agent", "mfrl", "--preset", "smoke", *SAVING, "--quiet", "--out")
+    assert cli.main([*words, "whole"]) == 0
+    (whole,) = Path("whole").rglob("seed_0")
+    expected = state([whole])
+    capfd.readouterr()
+    refused = 0
+    for free in range(0, 400_000, 16_384):
+        fill(free)
+        code, said = one_line((*words, folder / "runs"), capfd)
+        refused += code
+        assert not code or (
+            code == 1 and said.startswith("error: disk full: free some space; what was saved is intact")
+        )
+        fill(None)
+        assert one_line((*words, folder / "runs"), capfd) == (0, "")
+        run = folder / "runs" / whole.relative_to("whole")
+        assert state([run]) == expected
+        fill(0)
+        assert one_line(("evaluate", run, "--quiet"), capfd)[0] == 1
+        fill(None)
+        assert state([run]) == expected
+        shutil.rmtree(folder / "runs")
+    assert refused > 10
+
+
+def test_a_read_only_disk(disk, capfd, monkeypatch):
+    folder, _, read_only = disk
+    words = ("--preset", "smoke", "--quiet", "--out", folder / "runs")
+    task = ("run", "minatar/breakout", "--agent", "m5")
+    assert cli.main(list(map(str, (*task, *words)))) == 0
+    (run,) = folder.rglob("seed_0")
+    monkeypatch.setattr(record, "provenance", lambda: published.PROVENANCE)
+    publishable = published.write(out=folder / "others")
+    before = published.files(folder)
+    read_only()
+    capfd.readouterr()
+    for command in (
+        (*task, *words),
+        (*task, "--seed", "1", *words),
+        ("evaluate", run),
+        ("watch", run),
+        ("inspect", run),
+        ("publish", publishable, "--out", folder / "boards"),
+        ("sweep", "--tasks", "minatar/breakout", "--agents", "mfrl", *words),
+    ):
+        code, said = one_line(command, capfd)
+        if code:
+            assert said.startswith(f"error: cannot write to {folder}"), said
+    assert published.files(folder) == before

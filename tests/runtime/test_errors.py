@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import re
+
 import jax
 import jax.numpy as jnp
 import pytest
 
 from suite.runtime.compilation import quiet_xla
-from suite.runtime.errors import RunError, UserError, host_errors
+from suite.runtime.errors import RunError, UserError, host_errors, refused_writes_are_errors
 
 
 def called_back(error):
@@ -35,3 +38,28 @@ def test_other_errors_stay_what_they_are():
         raise KeyError("x")
     with pytest.raises(UserError, match=r"^as it is$"), host_errors():
         raise UserError("as it is")
+
+
+@pytest.mark.parametrize(
+    ("cause", "told"),
+    [
+        (
+            ValueError("RESOURCE_EXHAUSTED: write: No space left on device"),
+            "disk full: free some space; what was saved",
+        ),
+        (OSError(errno.ENOSPC, "No space left on device"), "disk full"),
+        (OSError(errno.EDQUOT, "quota"), "disk full"),
+        (OSError(errno.EROFS, "Read-only file system"), "Read-only file system: see to the disk"),
+        (ValueError("INTERNAL: Error writing x: Input/output error"), "Input/output error: see to the disk"),
+        (PermissionError(errno.EACCES, "Permission denied", "a/b"), "Permission denied, a/b: see to its permissions"),
+    ],
+)
+def test_what_a_disk_refuses_is_one_line_also_where_a_library_wraps_or_quotes_it(cause, told):
+    with pytest.raises(RunError, match=told), refused_writes_are_errors():
+        raise RuntimeError("wrapped") from cause
+
+
+def test_other_errors_are_left_alone():
+    for error in (OSError(errno.ENOENT, "nothing there"), BrokenPipeError(), UserError("Input/output error")):
+        with pytest.raises(type(error), match=re.escape(str(error))), refused_writes_are_errors():
+            raise error
