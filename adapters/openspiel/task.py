@@ -14,8 +14,6 @@ import hashlib
 import importlib.metadata
 import os
 import tempfile
-import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,7 +31,7 @@ from adapters.openspiel.library import canonical_name, load, not_played
 from adapters.openspiel.tables import Tables
 from suite.interface.environment import Environment, EnvironmentSpec, ObservationSpec, TimeStep
 from suite.interface.turns import Turn
-from suite.runtime.cache import cache_dir
+from suite.runtime.cache import cache_dir, read_arrays
 from suite.runtime.errors import UserError
 
 Progress = Callable[[str, float], None]
@@ -341,11 +339,9 @@ def _not_categorical(name: str) -> UserError:
 
 def read_tables(path: Path) -> Tables | None:
     """The tables in a cache file; None if there is no file, or it is broken and must be made again."""
+    arrays = read_arrays(path)
     names = {field.name for field in dataclasses.fields(Tables)}
-    broken = OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error
-    with contextlib.suppress(*broken), path.open("rb") as file, np.load(file) as stored:
-        return Tables(**{name: stored[name] for name in names})
-    return None
+    return Tables(**arrays) if arrays is not None and arrays.keys() == names else None
 
 
 def _write(path: Path, tables: Tables) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
+import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -75,7 +77,7 @@ def execute(args: argparse.Namespace) -> int:
         with _engine(args) as (start, jobs, where):
             if not args.quiet:
                 print(f"{_plan_line(runs)}; {where}; records in {out}", flush=True)
-            with _display(args.quiet) as show, contextlib.redirect_stdout(sys.stderr):  # Ray prints of nodes that died
+            with _display(args.quiet) as show, contextlib.redirect_stdout(_RayNews()):
                 sweep.sweep(runs, start, jobs, show)
     _print_results(runs)
     if args.json:
@@ -126,6 +128,15 @@ def _display(quiet: bool) -> Iterator[Callable[[Sequence[Run], bool], None]]:
             yield lambda runs, stopping: live.update(status_table(runs, stopping, console.height), refresh=True)
     else:
         yield _Lines(console)
+
+
+class _RayNews(io.TextIOBase):
+    """Takes what Ray prints when a node dies, pages of its state, and shows what is news of it, on stderr."""
+
+    def write(self, text: str) -> int:
+        for name in re.findall(r"node name: (\S+) has been marked dead", text):
+            print(f"Ray lost the node {name}: its runs go on elsewhere from their checkpoints", file=sys.stderr)
+        return len(text)
 
 
 class _Lines:

@@ -23,7 +23,7 @@ from suite.agent.phases import Agent
 from suite.configuration.schema import Config, hash_of
 from suite.interface.environment import Environment, EnvironmentSpec, State, TimeStep
 from suite.records.tables import write_whole
-from suite.runtime.cache import cache_dir
+from suite.runtime.cache import cache_dir, read_arrays
 from suite.runtime.compilation import enable_compilation_cache
 from suite.runtime.reporting import Reporter
 from suite.world_model.history import paid_before
@@ -124,15 +124,12 @@ def load(task: str, preset: str, reporter: Reporter) -> EvaluationSet:
       preset: how long the collecting agent learns, and how large it is.
       reporter: where progress goes.
     """
-    path = cache_folder(task, preset) / "trajectories.npz"
-    if not path.exists():
-        _build(path.parent, _collector(task, preset), reporter)
-    return EvaluationSet(**_read(path))
+    return EvaluationSet(**_cached(task, preset, "trajectories.npz", reporter))
 
 
-def load_pairs(task: str, preset: str) -> Pairs:
-    """What the extractor learns from; `load` has collected it."""
-    return Pairs(**_read(cache_folder(task, preset) / "pairs.npz"))
+def load_pairs(task: str, preset: str, reporter: Reporter) -> Pairs:
+    """What the extractor learns from; as `load`."""
+    return Pairs(**_cached(task, preset, "pairs.npz", reporter))
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -143,9 +140,14 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     write_whole(path, content.getvalue())
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path) as arrays:
-        return dict(arrays)
+def _cached(task: str, preset: str, name: str, reporter: Reporter) -> dict[str, np.ndarray]:
+    path = cache_folder(task, preset) / name
+    arrays = read_arrays(path)
+    if arrays is None:
+        _build(path.parent, _collector(task, preset), reporter)
+        arrays = read_arrays(path)
+    assert arrays is not None
+    return arrays
 
 
 def _collector(task: str, preset: str) -> Config:

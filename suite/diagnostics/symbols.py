@@ -17,6 +17,7 @@ from suite import registry
 from suite.diagnostics import evaluation_set
 from suite.diagnostics.evaluation_set import Pairs
 from suite.interface.environment import ObservationSpec
+from suite.runtime.cache import read_arrays
 from suite.runtime.reporting import Reporter
 from suite.tokenizers.patches import patch_grid, split_patches
 
@@ -80,16 +81,16 @@ def load(task: str, preset: str, reporter: Reporter) -> SymbolExtractor:
     path = evaluation_set.cache_folder(task, preset) / f"extractor-{VERSION}.npz"
     entry = registry.task(task)
     observation = entry.spec().observation
-    if not path.exists():
-        pairs = evaluation_set.load_pairs(task, preset)
+    arrays = read_arrays(path)
+    if arrays is None:
+        pairs = evaluation_set.load_pairs(task, preset, reporter)
         updates = UPDATES.get(preset, UPDATES["small"])
         reporter.message(f"training the symbol extractor on {np.sum(~pairs.validation):,} frames, once")
         trained = train(pairs, observation, entry.symbol_values, updates, reporter)
         leaves = {f"leaf_{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(trained.params))}
         facts = {"accuracy": np.array(trained.accuracy), "symbols": np.array(pairs.symbols.shape[-1])}
-        evaluation_set.write_arrays(path, leaves | facts)
-    with np.load(path) as stored:
-        arrays = dict(stored)
+        arrays = leaves | facts
+        evaluation_set.write_arrays(path, arrays)
     accuracy, symbols = float(arrays.pop("accuracy")), int(arrays.pop("symbols"))
     graph, template = nnx.split(nnx.eval_shape(lambda: Network(observation, symbols, entry.symbol_values, nnx.Rngs(0))))
     params = jax.tree.unflatten(jax.tree.structure(template), [jnp.asarray(arrays[name]) for name in sorted(arrays)])

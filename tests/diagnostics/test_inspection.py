@@ -122,6 +122,18 @@ def test_it_is_built_once(monkeypatch):
     assert folder != evaluation_set.cache_folder("unknown", "smoke")
 
 
+@pytest.mark.parametrize("name", ["trajectories.npz", "pairs.npz"])
+def test_what_is_broken_is_built_again(monkeypatch, name):
+    evaluation_set.load("corridor", "smoke", QUIET)
+    path = evaluation_set.cache_folder("corridor", "smoke") / name
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-100])
+    monkeypatch.setattr(evaluation_set, "_build", lambda *arguments: path.write_bytes(whole))
+    load = evaluation_set.load if name == "trajectories.npz" else evaluation_set.load_pairs
+    assert len(load("corridor", "smoke", QUIET).frames) > 0
+    assert path.read_bytes() == whole
+
+
 def test_the_extractor_learns(collected):
     place = np.random.default_rng(0).integers(0, 4, 400)
     frames = np.kron(np.eye(4, dtype=np.uint8)[place].reshape(-1, 2, 2, 1), np.full((1, 2, 2, 1), 255, np.uint8))

@@ -49,4 +49,9 @@ def test_a_cluster_that_loses_a_node_in_the_middle(cluster):
     assert {folder.resolve() for folder in finished()} == runs.keys() and len(runs) == 6
     assert files and snapshot(path.parent for path in files if path.name == "record.json") == files
     assert len(records()[cut_off]["resumed"]) == 1
+    said = Path("stderr").read_text().splitlines()
+    others = [line for line in said if not line.startswith("[")]  # of statuses: "[1/6] ..."
+    assert [line.partition(" the node ")[0] for line in others] == ["Ray lost"] * len(others) and len(others) <= 1, (
+        others
+    )
     assert log_of(cut_off).read_text().count(": suite run ") == 2
