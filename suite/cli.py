@@ -19,7 +19,7 @@ from types import ModuleType
 from typing import NoReturn
 
 from suite.runtime.compilation import quiet_xla, refuse_other_arithmetic
-from suite.runtime.errors import RunError, UserError, did_you_mean, host_errors, refused_writes_are_errors
+from suite.runtime.errors import RunError, UserError, did_you_mean, host_errors, refusals_are_errors
 
 COMMANDS = ("run", "list", "describe", "evaluate", "inspect", "watch", "compare", "sweep", "publish", "verify", "bench")
 STOPPED = 130
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     quiet_xla()
     try:
         refuse_other_arithmetic()
-        with refused_writes_are_errors(), host_errors():
+        with refusals_are_errors(), host_errors():
             return _dispatch(sys.argv[1:] if argv is None else list(argv))
     except (UserError, RunError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

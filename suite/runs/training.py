@@ -23,7 +23,7 @@ from suite.records.record import RunRecord, run_folder
 from suite.runs.evaluation import episode_rows, record_evaluation
 from suite.runs.saved_model import Remainder, SavedModel, agent_for
 from suite.runtime.compilation import Ahead
-from suite.runtime.errors import RunError, UserError, host_errors, refused_writes_are_errors
+from suite.runtime.errors import RunError, UserError, host_errors, refusals_are_errors
 from suite.runtime.reporting import Reporter
 from suite.runtime.signals import stop_signals
 
@@ -90,7 +90,7 @@ def run(
     folder = run_folder(out, config)
     if resume and not (folder / "record.json").exists():
         raise UserError(f"nothing to resume in {folder}: run without --resume to start there")
-    with refused_writes_are_errors(), RunRecord.open_or_create(folder, config, entry.spec()) as record:
+    with refusals_are_errors(), RunRecord.open_or_create(folder, config, entry.spec()) as record:
         if record.finished:
             checkpoint.drop_resume(folder / "checkpoints")  # a kill may have come before
             return _result(record, "already finished")

@@ -56,15 +56,15 @@ FULL, BROKEN = (errno.ENOSPC, errno.EDQUOT), (errno.EROFS, errno.EIO, errno.EFBI
 
 
 @contextlib.contextmanager
-def refused_writes_are_errors() -> Iterator[None]:
-    """Turns what a full, broken or read-only disk refuses, wherever inside it is noticed, into a `RunError`."""
+def refusals_are_errors() -> Iterator[None]:
+    """Turns what a full, broken or read-only disk, or the memory, refuses into a `RunError`, wherever it is noticed."""
     try:
         yield
     except (UserError, RunError, BrokenPipeError):
         raise
     except Exception as error:
         if problem := _refused(error):
-            raise RunError(f"{problem}; what was saved is intact: run the same command again afterwards") from error
+            raise RunError(f"{problem}; what was saved is intact") from error
         raise
 
 
@@ -72,11 +72,13 @@ def _refused(error: BaseException | None) -> str:
     """What the system refused and what to do, also where a library wraps its error or only quotes it; "" if nothing."""
     while error is not None:
         if any(getattr(error, "errno", None) == number or os.strerror(number) in str(error) for number in FULL):
-            return "disk full: free some space"
+            return "disk full: free some space, and run the same command again"
         for number in BROKEN:
             if getattr(error, "errno", None) == number or os.strerror(number) in str(error):
                 return f"{os.strerror(number)}: see to the disk"
         if isinstance(error, PermissionError):
             return f"{error.strerror}, {error.filename}: see to its permissions"
+        if isinstance(error, MemoryError) or "Out of memory" in str(error):
+            return "out of memory: sizes, buffers or numbers of environments must be smaller on this machine"
         error = error.__cause__ or error.__context__
     return ""

@@ -15,7 +15,7 @@ from suite.records.event_files import EventFile
 from suite.records.record import RunRecord, require_writable, run_folder
 from suite.records.tables import CsvTable, cell, write_whole
 from suite.registry import resolve
-from suite.runtime.errors import RunError, UserError, refused_writes_are_errors
+from suite.runtime.errors import RunError, UserError, refusals_are_errors
 from tests.tiny import CORRIDOR_SPEC
 
 CONFIG = resolve("craftax_classic", "m5", "smoke")
@@ -304,8 +304,10 @@ def test_a_full_disk_leaves_what_was_there(tmp_path, monkeypatch):
     with create(tmp_path) as record:
         play(record, [10])
         before = contents(record.folder)
-        intact = pytest.raises(RunError, match=r"^disk full: free some space; what was saved is intact")
-        with full_disk(monkeypatch), intact, refused_writes_are_errors():
+        intact = pytest.raises(
+            RunError, match=r"^disk full: free some space, and run the same command again; what was saved is intact"
+        )
+        with full_disk(monkeypatch), intact, refusals_are_errors():
             play(record, [20])
         assert contents(record.folder) == before
         with full_disk(monkeypatch), pytest.raises(OSError):
