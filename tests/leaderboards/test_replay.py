@@ -10,6 +10,7 @@ import pytest
 
 from leaderboards.replay import differences, first_iteration
 from suite import registry
+from suite.configuration.schema import Config
 from suite.records.record import RunRecord
 from suite.runs import training
 from suite.runtime.reporting import QuietReporter
@@ -72,11 +73,14 @@ def longer(folder, runs):
 
 
 def setting(folder, runs):
-    """Another configuration than the run had."""
+    """Another configuration than the run had, and its digest in the record."""
     path = folder / "config.json"
     config = json.loads(path.read_text())
     config["ppo"]["discount"] = 0.5
     path.write_text(json.dumps(config))
+    path = folder / "record.json"
+    fields = json.loads(path.read_text())
+    path.write_text(json.dumps(fields | {"config_digest": Config(**config).digest()}))
 
 
 FORGERIES = {

@@ -52,14 +52,14 @@ def finish(*words):
 
 
 def kill(process, reached, delay):
-    """Kills it so many seconds after it has got somewhere, unless it ends before."""
+    """Kills it so many seconds after it has got somewhere, unless it ends before; whether it was killed."""
     while process.poll() is None and not reached():
         time.sleep(0.002)
     try:
         process.wait(delay)
     except subprocess.TimeoutExpired:
         process.send_signal(signal.SIGKILL)
-        process.wait()
+    return process.wait() == -signal.SIGKILL
 
 
 def lines(path):
@@ -99,13 +99,13 @@ def test_runs(family):
     seconds = (took["total"] - took["start"]) / iterations
     expected = state([whole])
     assert state([warm]) == expected
-    draw = random.Random(f"{SEED} {family}")
+    draw, killed = random.Random(f"{SEED} {family}"), 0
     for number in range(KILLS):
         out = f"killed_{number}"
         folder = out / whole.relative_to("whole")
         for _ in range(draw.choice((1, 1, 2))):
             rows, delay = draw.randrange(iterations + 1), draw.uniform(0, seconds)
-            kill(
+            killed += kill(
                 start(*words, out),
                 lambda rows=rows, folder=folder: (
                     (folder / "record.json").exists() and len(lines(folder / "metrics.csv")) >= rows
@@ -116,6 +116,7 @@ def test_runs(family):
         finish(*words, out)
         assert state([folder]) == expected, f"{family}, kill {number}: {rows} iterations and {delay:.3f} seconds"
         kept(folder, before)
+    assert killed > KILLS // 2
 
 
 def test_a_sweep():
@@ -127,10 +128,10 @@ def test_a_sweep():
     runs = [path.parent.relative_to("whole") for path in Path("whole").rglob("record.json")]
     expected = [state(["whole" / run]) for run in runs]
     assert len(runs) == 2
-    draw = random.Random(f"{SEED} sweep")
+    draw, killed = random.Random(f"{SEED} sweep"), 0
     for number in range(KILLS):
         out = Path(f"killed_{number}")
-        kill(start(*words, str(out)), lambda: True, draw.uniform(0, seconds))
+        killed += kill(start(*words, str(out)), lambda: True, draw.uniform(0, seconds))
         owners = [owner(path.parent) for path in out.rglob("run.lock")]
         if draw.random() < 0.5:
             for process in filter(None, owners):
@@ -138,6 +139,7 @@ def test_a_sweep():
                     os.kill(process, signal.SIGKILL)
         finish(*words, str(out))
         assert [state([out / run]) for run in runs] == expected, f"sweep, kill {number}"
+    assert killed > KILLS // 2
 
 
 def test_publish(monkeypatch):
@@ -152,15 +154,18 @@ def test_publish(monkeypatch):
         return {path.relative_to(out): path.read_bytes() for path in sorted(Path(out).rglob("*")) if path.is_file()}
 
     expected = tree("whole")
-    draw = random.Random(f"{SEED} publish")
+    draw, killed = random.Random(f"{SEED} publish"), 0
     for number in range(KILLS):
         out = Path(f"killed_{number}")
         files, delay = draw.randrange(len(expected)), draw.uniform(0, 0.02)
         process = start(*words, str(out), "--page", str(out))
-        kill(process, lambda out=out, files=files: sum(path.is_file() for path in out.rglob("*")) >= files, delay)
+        killed += kill(
+            process, lambda out=out, files=files: sum(path.is_file() for path in out.rglob("*")) >= files, delay
+        )
         finish(*words, str(out), "--page", str(out))
         assert tree(out) == expected, f"publish, kill {number}: {files} files and {delay:.3f} seconds"
         finish("verify", str(out))
+    assert killed > KILLS // 2
 
 
 @pytest.fixture
