@@ -281,6 +281,8 @@ def test_a_folder_that_cannot_be(tmp_path):
             require_writable(folder)
         with pytest.raises(UserError, match="cannot write"):
             RunRecord.open_or_create(folder, CONFIG, CORRIDOR_SPEC)
+    with pytest.raises(UserError, match=r"choose another --page$"):
+        require_writable(tmp_path / "file", "--page")
 
 
 # A full disk.

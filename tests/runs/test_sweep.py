@@ -308,3 +308,9 @@ def test_a_run_that_fails_does_not_stop_the_others(suite):
     assert (done["status"], done["steps"], done["seed"]) == ("finished", 96, 1)
     assert "[1/2] openspiel/tic_tac_toe, agent random, seed 0: failed" in err
     assert "[2/2] openspiel/tic_tac_toe, agent random, seed 1: finished, 96/96 steps" in err
+
+
+def test_the_reason_is_the_error_and_not_what_a_library_says_after_it(tmp_path):
+    log_of(tmp_path).write_text("  0% | start\nerror: disk full: free some space\nTraceback\nRuntimeError: closed\n")
+    outcome = Process(["run"], tmp_path)._ended(1)
+    assert (outcome.status, outcome.reason) == ("failed", "disk full: free some space")

@@ -327,6 +327,17 @@ def test_a_broken_checkpoint_gives_way_to_the_one_before(tmp_path, uninterrupted
     assert "damaged" in warned[0]
 
 
+def test_where_no_checkpoint_is_whole_only_who_trains_is_told_of_out(tmp_path, copied):
+    folder, again = copied
+    put_status(folder, "running")
+    (path,) = (folder / "checkpoints").iterdir()
+    path.rename(path.with_name("step_000000000160"))
+    with pytest.raises(UserError, match=r"it is of step 192\) .* is whole; choose another --out to start anew$"):
+        again()
+    with pytest.raises(UserError, match=r"no checkpoint in \S+ is whole$"):
+        evaluation.evaluate(folder, 4, QuietReporter())
+
+
 def test_without_a_world_model_nothing_of_it_exists(tmp_path):
     result = training.run(config("mfrl"), tmp_path, QuietReporter())
     columns = pd.read_csv(result.folder / "metrics.csv").columns
