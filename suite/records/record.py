@@ -17,13 +17,10 @@ No clock enters episodes.csv and metrics.csv, so that a run that was stopped and
 
 from __future__ import annotations
 
-import contextlib
 import datetime
-import fcntl
 import os
-import platform
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -33,16 +30,15 @@ from suite import registry
 from suite.configuration.overrides import dotted, first_problem
 from suite.configuration.schema import Config, hash_of
 from suite.records.fields import SCHEMA, ProtocolFields, RecordFields, read_json, write_json
+from suite.records.lock import LOCK, acquire, closed_on_error
 from suite.records.provenance import package_version, peak_memory, provenance
 from suite.records.tables import CsvTable, read_table
-from suite.runtime.errors import FolderInUseError, RunError, UserError
+from suite.runtime.errors import RunError, UserError
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from suite.interface.environment import EnvironmentSpec
-
-LOCK = "run.lock"
 
 
 def run_folder(out: Path, config: Config) -> Path:
@@ -110,8 +106,8 @@ class RunRecord:
           UserError: the folder cannot be written, is in use, or holds a run already.
         """
         require_writable(folder)
-        lock = _acquire(folder)
-        with _closed_on_error(lock):
+        lock = acquire(folder)
+        with closed_on_error(lock):
             taken = [path for path in (folder / "record.json", *folder.glob("*.csv")) if path.exists()]
             if taken:
                 raise UserError(f"{folder} already holds {taken[0].name}; choose another --out")
@@ -165,8 +161,8 @@ class RunRecord:
           UserError: no run folder, another schema, damaged, changed, another run than expected, or in use.
         """
         RecordFields.read(folder)  # nothing, not even a lock, is written into a folder that holds no run
-        held = _acquire(folder) if lock else None
-        with _closed_on_error(held):
+        held = acquire(folder) if lock else None
+        with closed_on_error(held):
             fields = RecordFields.read(folder)
             stored = _read_config(folder, fields)
             if config is not None:
@@ -358,37 +354,6 @@ class RunRecord:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-
-def _acquire(folder: Path) -> IO[str]:
-    """The exclusive lock on a folder, held until the file is closed or its process ends, however it ends."""
-    try:
-        file = (folder / LOCK).open("a+")
-    except OSError as error:
-        raise UserError(f"cannot write to {folder}: {error.strerror}") from error
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        file.seek(0)
-        owner = file.read().strip()
-        file.close()
-        raise FolderInUseError(f"{folder} is in use by another process ({owner or 'just started'})") from None
-    with _closed_on_error(file):
-        file.truncate(0)
-        file.write(f"pid {os.getpid()} on {platform.node()}")
-        file.flush()
-    return file
-
-
-@contextlib.contextmanager
-def _closed_on_error(lock: IO[str] | None) -> Iterator[None]:
-    try:
-        yield
-    except BaseException:
-        if lock is not None:
-            with contextlib.suppress(OSError):  # of a full disk, which it was about
-                lock.close()
-        raise
 
 
 def _require_same_run(folder: Path, stored: Config, asked: Config) -> None:
