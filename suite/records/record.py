@@ -96,7 +96,7 @@ class RunRecord:
         }
         self._events: Any = None
         self._purge_step: int | None = None
-        self._new = False
+        self._new = self._all_counted = False
 
     @classmethod
     def create(cls, folder: Path, config: Config, spec: EnvironmentSpec) -> RunRecord:
@@ -325,8 +325,9 @@ class RunRecord:
           UserError: the table cannot be read, or of a finished run other episodes are there than were counted.
         """
         episodes = self.table("episodes")
-        if self.finished:
+        if self.finished and not self._all_counted:
             self._counted(self.steps, episodes)
+            self._all_counted = True  # what is finished does not change
         return episodes
 
     def table(self, name: str) -> pd.DataFrame:
