@@ -28,7 +28,7 @@ from suite.records.record import RunRecord
 from suite.runs import training
 from suite.runs.saved_model import RestoredRun, restore
 from suite.runs.training import Callback
-from suite.runtime.compilation import enable_compilation_cache, quiet_xla, refuse_other_arithmetic
+from suite.runtime.compilation import device_kind, enable_compilation_cache, quiet_xla, refuse_other_arithmetic
 from suite.runtime.errors import UserError
 from suite.runtime.reporting import QuietReporter, Reporter, RichReporter
 from suite.world_model.history import MOST
@@ -42,9 +42,10 @@ def make(task: str, num_envs: int = 1) -> Batched:
     `jax.jit` or not.
 
     Raises:
-      UserError: no such task.
+      UserError: no such task, or nothing to compute on.
     """
     _begin()
+    device_kind()
     return Batched(registry.task(task).make()(QuietReporter().texture), num_envs)
 
 

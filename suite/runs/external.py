@@ -24,7 +24,7 @@ from suite.interface.environment import EnvironmentSpec
 from suite.policy.actor_critic import PolicyOutput
 from suite.policy.ppo import TargetStatistics, Trajectory
 from suite.runs.evaluation import play_episodes
-from suite.runtime.compilation import enable_compilation_cache
+from suite.runtime.compilation import device_kind, enable_compilation_cache
 from suite.runtime.errors import UserError, did_you_mean
 from suite.runtime.reporting import Reporter
 
@@ -127,6 +127,7 @@ def evaluate_policy(task: str, reference: str, episodes: int | None, reporter: R
     shape = (NUM_ENVS, *spec.observation.shape)
     flags = np.ones(NUM_ENVS, bool)
     policy.ask(np.zeros(shape, np.uint8), flags, flags)  # before anything is compiled
+    device_kind()  # or one line that says that there is none
     enable_compilation_cache()
     contest = Contest(policy, Batched(entry.make()(progress=reporter.texture), NUM_ENVS))
     count = episodes or (GAMES if spec.two_player else NUM_ENVS)

@@ -18,7 +18,7 @@ from suite.interface.tokens import TokenizerState
 from suite.policy.ppo import PolicyTrainState
 from suite.records import checkpoint
 from suite.records.record import RunRecord
-from suite.runtime.compilation import enable_compilation_cache
+from suite.runtime.compilation import device_kind, enable_compilation_cache
 from suite.runtime.errors import UserError
 from suite.runtime.reporting import Reporter
 from suite.world_model.training import WorldModelTrainState
@@ -151,6 +151,7 @@ def agent_for(config: Config, reporter: Reporter) -> Agent:
     if shared not in _agents:
         _agents.clear()
         jax.clear_caches()
+        device_kind()  # or one line that says that there is none
         enable_compilation_cache()
         environment = registry.task(config.task).make()(progress=reporter.texture)
         _agents[shared] = Agent(shared, environment)

@@ -102,14 +102,9 @@ def _platforms() -> list[str]:
 
 
 def enable_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder (`SUITE_CACHE_DIR`), unless JAX was told of another.
-
-    Raises:
-      UserError: JAX has nothing to compute on, as `device_kind` says.
-    """
+    """Keeps compiled programs in the user's cache folder (`SUITE_CACHE_DIR`), unless JAX was told of another."""
     import jax
 
-    device_kind()
     if jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         jax.config.update("jax_compilation_cache_dir", str(cache_dir() / "xla" / cpu_digest()))
     # Small programs too: reading one takes 6 ms, and compiling it 15 and more.
