@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import os
 import re
 import shutil
 import signal
+import sys
 from pathlib import Path
 
 import jax
@@ -22,7 +25,7 @@ from suite.records.record import RunRecord
 from suite.runs import evaluation, training
 from suite.runs.saved_model import restore
 from suite.runtime.errors import RunError, UserError
-from suite.runtime.reporting import QuietReporter
+from suite.runtime.reporting import QuietReporter, RichReporter
 from tests.tiny import CORRIDOR, PENNIES
 
 
@@ -271,6 +274,21 @@ def test_a_second_signal_waits_for_the_checkpoint_that_is_being_written(tmp_path
         training.run(config(), tmp_path, QuietReporter())
     (folder,) = tmp_path.glob("*/*/*/seed_0")
     assert checkpoint.latest_step(folder / "checkpoints") == 64
+
+
+def test_a_terminal_that_is_gone_cannot_be_told_and_the_run_stops_all_the_same(tmp_path, monkeypatch, terminal):
+    class Gone(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(errno.EIO, "Input/output error")
+
+    def close(iteration):
+        monkeypatch.setattr(sys, "stderr", Gone())
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    result = training.run(config(), tmp_path, RichReporter(interval=0), callbacks=[close])
+    monkeypatch.undo()
+    assert (result.status, result.steps) == ("stopped", 32)
+    assert checkpoint.latest_step(result.folder / "checkpoints") == 32
 
 
 def test_records_are_complete(uninterrupted):
