@@ -56,7 +56,7 @@ class Parts:
     @property
     def learns_from_real(self) -> bool:
         """Whether real play teaches its policy."""
-        return self.config.ppo.learn_from_real and self.config.policy.kind != "uniform"
+        return self.config.learns_from_real
 
     @property
     def ages(self) -> int:

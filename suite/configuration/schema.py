@@ -217,6 +217,8 @@ class CheckpointConfig:
 
     every_steps: Positive = 50_000
     keep: Annotated[int, Field(ge=2, lt=2**31)] = 2  # two, so that one may be found broken
+    # A finished run keeps what more steps (`--steps`) would need, if it can take them (`Config.tied_to_budget`).
+    keep_resume: bool = True
 
 
 @config_class
@@ -248,6 +250,11 @@ class Config:
         return self.world_model.enabled or self.imagination.world == "game"
 
     @property
+    def learns_from_real(self) -> bool:
+        """Whether real play teaches the policy."""
+        return self.ppo.learn_from_real and self.policy.kind != "uniform"
+
+    @property
     def steps_per_iteration(self) -> int:
         """Real environment steps of one iteration: N_env x T_env."""
         return self.environment.num_envs * self.environment.rollout_length
@@ -261,6 +268,16 @@ class Config:
     def total_steps(self) -> int:
         """Real steps actually taken: `iterations * steps_per_iteration`, at most the budget."""
         return self.iterations * self.steps_per_iteration
+
+    @property
+    def tied_to_budget(self) -> tuple[str, ...]:
+        """Settings, as "name=value", by which the same step is another under a larger budget. None: it is the same."""
+        learns = self.learns_from_real or self.dreams
+        tied = {
+            "ppo.anneal_learning_rate=true": learns and self.ppo.anneal_learning_rate,
+            "imagination.schedule=linear": self.dreams and self.imagination.schedule == "linear",
+        }
+        return tuple(name for name, applies in tied.items() if applies)
 
     def imagined_updates(self, steps: int, known: float | None = None) -> int:
         """Imagined policy updates of the iteration that brings the run to `steps` real steps.

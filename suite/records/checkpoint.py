@@ -110,14 +110,17 @@ def latest_step(folder: Path) -> int | None:
     return next((step for step in _steps(folder) if not _damage(folder / _name(step))), None)
 
 
-def drop_resume(folder: Path) -> None:
-    """Deletes what only going on needs, and all but the newest checkpoint: for a finished run."""
+def drop_resume(folder: Path, but_newest: bool = False) -> None:
+    """Deletes all but the newest checkpoint and, without `but_newest`, what of it only going on needs.
+
+    For a finished run, which goes on only if it is given more steps.
+    """
     newest = latest_step(folder)
     for step in _steps(folder) if newest is not None else ():
         path = folder / _name(step)
         if step != newest:
             shutil.rmtree(path)
-        elif (path / "resume").exists():
+        elif not but_newest and (path / "resume").exists():
             _write_manifest(path, without="resume")  # first: a kill in between leaves a whole checkpoint
             shutil.rmtree(path / "resume")
 

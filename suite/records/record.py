@@ -10,7 +10,7 @@
     timing.csv        seconds per phase, one row per iteration (of evaluations, record.json has the sum)
     tensorboard/      the metrics as curves
     checkpoints/      see `suite.records.checkpoint`
-    replaced/         rows of iterations that a resumed run played again
+    replaced/         rows of iterations that a resumed run played again, and of last evaluations that no longer are
 
 No clock enters episodes.csv and metrics.csv, so that a run that was stopped and resumed writes the same bytes.
 """
@@ -20,7 +20,7 @@ from __future__ import annotations
 import datetime
 import os
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from suite.interface.environment import EnvironmentSpec
+
+NEXT_CONFIG = "config.next.json"  # of a run that is being given more steps, until its record says that it has them
 
 
 def run_folder(out: Path, config: Config) -> Path:
@@ -158,15 +160,19 @@ class RunRecord:
           lock: for writing; without it, only for reading.
 
         Raises:
-          UserError: no run folder, another schema, damaged, changed, another run than expected, or in use.
+          UserError: no run folder, another schema, damaged, changed, another run than expected, or in use; or a larger
+            budget is expected (`asks_for_more`) of a run that cannot be given one.
         """
         RecordFields.read(folder)  # nothing, not even a lock, is written into a folder that holds no run
         held = acquire(folder) if lock else None
         with closed_on_error(held):
             fields = RecordFields.read(folder)
+            if held is not None:
+                _settle_config(folder, fields)
             stored = _read_config(folder, fields)
             if config is not None:
                 _require_same_run(folder, stored, config)
+                _require_rest(folder, fields, config)
             if config is not None and spec is not None:
                 _require_same_rules(folder, fields.protocol, protocol(config, spec))
             return cls(folder, config or stored, fields, spec, held)
@@ -180,8 +186,13 @@ class RunRecord:
 
     @property
     def finished(self) -> bool:
-        """Whether the run took all its steps."""
-        return self.fields.status == "finished"
+        """Whether the run took all its steps: those that are asked for."""
+        return self.fields.status == "finished" and not self.asks_for_more
+
+    @property
+    def asks_for_more(self) -> bool:
+        """Whether it was opened with a larger budget than it has; see `extend`."""
+        return self.config.protocol.steps > self.fields.protocol.steps
 
     @property
     def steps(self) -> int:
@@ -260,7 +271,7 @@ class RunRecord:
         # Of a game that ends with a move of chance, which is no step, an episode may have the step of an iteration
         # that ended before it: so many are counted, not those up to a step.
         most = self._counted(step, self.table("episodes"))
-        aside = self._aside(step)
+        aside = self._aside(f"after_step_{step}")
         moved = sum(
             table.rewind(step, aside / f"{name}.csv", most if name == "episodes" else None)
             for name, table in self._tables.items()
@@ -272,13 +283,27 @@ class RunRecord:
             self.update(steps=step, resumed=[*self.fields.resumed, resumed])
         return moved
 
+    def extend(self, evaluated: Collection[int]) -> None:
+        """Takes the larger budget that it was opened with, as if it had had that from the start.
+
+        Args:
+          evaluated: after which steps it would then have been evaluated; evaluations of others move to `replaced/`.
+        """
+        rules, digest = protocol(self.config, self.spec), self.config.digest()
+        aside = self._aside(f"with_{self.fields.protocol.steps}_steps") / "evaluations.csv"
+        write_json(self.folder / NEXT_CONFIG, self.config.as_dict())
+        self._tables["evaluations"].set_aside(lambda step: step not in evaluated, aside)
+        # From here on it has that budget. If it is killed before, whoever asks for as much again comes here again.
+        self.update(config_digest=digest, protocol=rules, protocol_hash=rules.hash, status="running", ended=None)
+        _settle_config(self.folder, self.fields)
+
     def rewind_evaluations(self, step: int) -> None:
         """Moves the evaluation episodes of the checkpoint at `step`, the newest, to `replaced/`: not all are there."""
-        self._tables["evaluations"].rewind(step - 1, self._aside(step - 1) / "evaluations.csv")
+        self._tables["evaluations"].rewind(step - 1, self._aside(f"after_step_{step - 1}") / "evaluations.csv")
 
-    def _aside(self, step: int) -> Path:
+    def _aside(self, why: str) -> Path:
         folders = self.folder / "replaced"
-        return folders / f"{1 + sum(1 for _ in folders.glob('*')):04d}_after_step_{step}"
+        return folders / f"{1 + sum(1 for _ in folders.glob('*')):04d}_{why}"
 
     def _begin_tables(self) -> None:
         for name, columns in self.fields.columns.items():
@@ -360,14 +385,32 @@ class RunRecord:
 def _require_same_run(folder: Path, stored: Config, asked: Config) -> None:
     old, new = dotted(stored), dotted(asked)
     for name in new:
-        if old[name] != new[name] and not name.startswith(("checkpoint.", "evaluation.")):
-            raise UserError(f"{folder} holds a run with {name}={old[name]}, not {new[name]}; choose another --out")
+        if old[name] == new[name] or name.startswith(("checkpoint.", "evaluation.")):
+            continue
+        why = ""
+        if name == "protocol.steps" and asked.protocol.steps > stored.protocol.steps:
+            if not asked.tied_to_budget:
+                continue
+            why = f", and what it learned depends on the budget, by {' and '.join(asked.tied_to_budget)}"
+        raise UserError(f"{folder} holds a run with {name}={old[name]}, not {new[name]}{why}; choose another --out")
+
+
+def _require_rest(folder: Path, fields: RecordFields, asked: Config) -> None:
+    """A finished run can take more steps only with the half of its last checkpoint that going on needs."""
+    had = fields.protocol.steps
+    if fields.status != "finished" or asked.protocol.steps <= had:
+        return
+    if not any((folder / "checkpoints").glob("step_*/resume")):
+        raise UserError(
+            f"{folder} holds a run that is finished after protocol.steps={had} and did not keep what more steps need "
+            "(checkpoint.keep_resume=false, or an earlier version); choose another --out"
+        )
 
 
 def _require_same_rules(folder: Path, old: ProtocolFields, new: ProtocolFields) -> None:
     for name, value in new:
         before = getattr(old, name)
-        if before != value:
+        if before != value and not (name == "steps" and value > before):  # more may be asked for
             raise UserError(
                 f"{folder} was started under {name}={before}, not the present {value}; choose another --out"
             )
@@ -375,7 +418,7 @@ def _require_same_rules(folder: Path, old: ProtocolFields, new: ProtocolFields) 
 
 def _read_config(folder: Path, record: RecordFields) -> Config:
     """The configuration that was run: what `record` has the digest of."""
-    stored = read_json(folder, "config.json")
+    stored = read_json(folder, _config_file(folder, record))
     try:
         config = Config(**stored)
     except ValidationError as error:
@@ -385,11 +428,27 @@ def _read_config(folder: Path, record: RecordFields) -> Config:
             raise UserError(
                 f"{folder}/record.json says {name}={getattr(record, name)}, config.json {getattr(config, name)}"
             )
-    # Of the file as it was written, as `Config.digest`: later versions may have fields more.
-    digest = hash_of({name: value for name, value in stored.items() if name not in ("checkpoint", "evaluation")})
-    if record.config_digest != digest:
+    if record.config_digest != _digest_of(stored):
         raise UserError(f"{folder}/config.json is not the configuration that was run ({record.config_digest})")
     return config
+
+
+def _digest_of(stored: Mapping[str, Any]) -> str:
+    """`Config.digest` of a file as it was written: later versions may have fields more."""
+    return hash_of({name: value for name, value in stored.items() if name not in ("checkpoint", "evaluation")})
+
+
+def _config_file(folder: Path, record: RecordFields) -> str:
+    """The name of the file that holds the configuration."""
+    if not (folder / NEXT_CONFIG).exists() or _digest_of(read_json(folder, NEXT_CONFIG)) != record.config_digest:
+        return "config.json"
+    return NEXT_CONFIG
+
+
+def _settle_config(folder: Path, record: RecordFields) -> None:
+    """Gives the file its usual name."""
+    if (name := _config_file(folder, record)) == NEXT_CONFIG:
+        os.replace(folder / name, folder / "config.json")
 
 
 def _now() -> str:

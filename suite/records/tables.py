@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,6 +79,14 @@ class CsvTable:
 
     def rewind(self, step: int, aside: Path, most: int | None = None) -> int:
         """Moves rows beyond `step` or `most` of them, and a last row that was cut off, to `aside`; returns how many."""
+        return self._set_aside(lambda of, kept: of > step or (most is not None and kept >= most), aside)
+
+    def set_aside(self, which: Callable[[int], bool], aside: Path) -> int:
+        """Moves the rows of some steps, and a last row that was cut off, to the file `aside`; returns how many."""
+        return self._set_aside(lambda of, kept: which(of), aside)
+
+    def _set_aside(self, which: Callable[[int, int], bool], aside: Path) -> int:
+        """`which` is asked with a row's step and how many rows stay before it."""
         if not self.path.exists():
             return 0
         header, *rows = self.path.read_bytes().splitlines(keepends=True) or [b""]
@@ -86,8 +94,8 @@ class CsvTable:
             header, rows = b"", [header]
         kept, moved = list[bytes](), list[bytes]()
         for row in rows:
-            stays = _whole_and_until(row, step) and (most is None or len(kept) < most)
-            (kept if stays else moved).append(row)
+            step = _step(row)
+            (moved if step is None or which(step, len(kept)) else kept).append(row)
         if moved:
             aside.parent.mkdir(parents=True, exist_ok=True)
             # First the copy, then the cut: a kill in between leaves rows twice, never lost.
@@ -184,8 +192,9 @@ def _header(path: Path) -> tuple[str, ...]:
         return tuple(next(csv.reader(file), ()))
 
 
-def _whole_and_until(row: bytes, step: int) -> bool:
+def _step(row: bytes) -> int | None:
+    """The step of a row; None if it was cut off."""
     try:
-        return row.endswith(b"\n") and int(row.partition(b",")[0]) <= step
+        return int(row.partition(b",")[0]) if row.endswith(b"\n") else None
     except ValueError:
-        return False
+        return None

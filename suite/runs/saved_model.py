@@ -13,7 +13,7 @@ from suite.agent.phases import Agent
 from suite.agent.replay import ReplayState
 from suite.agent.rollout import RolloutState
 from suite.agent.state import TrainState
-from suite.configuration.schema import CheckpointConfig, Config, EvaluationConfig
+from suite.configuration.schema import CheckpointConfig, Config, EvaluationConfig, ProtocolConfig
 from suite.interface.tokens import TokenizerState
 from suite.policy.ppo import PolicyTrainState
 from suite.records import checkpoint
@@ -142,12 +142,16 @@ _agents: dict[Config, Agent] = {}  # the last one built
 
 
 def agent_for(config: Config, reporter: Reporter) -> Agent:
-    """The agent of a configuration. Those that differ by seed or in when runs are evaluated and saved share one.
+    """The agent of a configuration. Those that differ by seed, by a budget that nothing is tied to, or in when runs are
+    evaluated and saved share one.
 
     With it they share its compiled programs. Those of the agent before are dropped: they would stay for good, and on a
     CPU each agent's are thousands of memory maps, of which Linux gives a process 65,530. XLA crashes where they end.
     """
-    shared = dataclasses.replace(config, seed=0, evaluation=EvaluationConfig(), checkpoint=CheckpointConfig())
+    protocol = config.protocol if config.tied_to_budget else ProtocolConfig(steps=config.steps_per_iteration)
+    shared = dataclasses.replace(
+        config, seed=0, protocol=protocol, evaluation=EvaluationConfig(), checkpoint=CheckpointConfig()
+    )
     if shared not in _agents:
         _agents.clear()
         jax.clear_caches()

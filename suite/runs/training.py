@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -92,7 +93,7 @@ def run(
         raise UserError(f"nothing to resume in {folder}: run without --resume to start there")
     with refusals_are_errors(), RunRecord.open_or_create(folder, config, entry.spec()) as record:
         if record.finished:
-            checkpoint.drop_resume(folder / "checkpoints")  # a kill may have come before
+            _forget(record)  # a kill may have come before, or more was kept until now
             return _result(record, "already finished")
         return _Training(config, agent_for(config, reporter), record, reporter, callbacks).run()
 
@@ -183,7 +184,7 @@ class _Training:
 
     def _passed(self, before: int, every: int) -> bool:
         """Whether the last iteration, begun at step `before`, reached another multiple of `every` (0: of nothing)."""
-        return bool(every) and self.steps // every > before // every
+        return _passes(before, self.steps, every)
 
     def _restore(self) -> TrainState:
         key = start_key(self.config.seed)
@@ -195,6 +196,7 @@ class _Training:
             raise UserError(f"{error}; choose another --out to start anew") from error
         if restored is None:
             self.record.rewind(0)
+            self._extend()
             self.ahead.begin(first_programs(self.agent, template))
             return self.agent.init(key)
         for warning in restored.warnings:
@@ -207,12 +209,20 @@ class _Training:
                 f"{self.checkpoints} holds only the model of step {self.steps:,}, which cannot be trained on"
             )
         self.record.rewind(self.steps)
+        self._extend()
         self.reporter.message(f"resuming at step {self.steps:,}")
         if not self.done:
             self.ahead.begin(first_programs(self.agent, template))
         # A run that was killed at its end has dropped what only going on needs.
         resume = restored.resume or dict.fromkeys(remainder)
         return Remainder(**resume).with_model(restored.model)
+
+    def _extend(self) -> None:
+        """Gives a run that went back to its newest checkpoint the larger budget, if it is asked for."""
+        if self.record.asks_for_more:
+            every = self.config.evaluation.every_steps
+            ends = itertools.pairwise([0, *self.record.table("metrics")["step"]])
+            self.record.extend({end for before, end in ends if _passes(before, end, every)})
 
     def _iterate(self, state: TrainState) -> TrainState:
         """One iteration of Algorithm 1, and what it leaves in the record."""
@@ -294,8 +304,8 @@ class _Training:
         if checkpoint.latest_step(self.checkpoints) != self.steps:
             self._save(state)
         self._evaluate(state)
-        checkpoint.drop_resume(self.checkpoints)
-        self.record.finish(self.steps)  # last: what is finished is never touched again
+        _forget(self.record)
+        self.record.finish(self.steps)  # last: what is finished goes on only if it is given more steps
 
     def _heard(self, count: int) -> None:
         """The first signal ends the run after this iteration, with a checkpoint; the second at once.
@@ -307,6 +317,18 @@ class _Training:
             raise KeyboardInterrupt
         self.stop_requested = True
         self.reporter.message("stopping after this iteration, with a checkpoint (again: stop now)")
+
+
+def _passes(before: int, steps: int, every: int) -> bool:
+    """Whether there is a multiple of `every` after `before` and up to `steps`."""
+    return bool(every) and steps // every > before // every
+
+
+def _forget(record: RunRecord) -> None:
+    """Deletes what a finished run needs no longer."""
+    config = record.config
+    more = config.checkpoint.keep_resume and not config.tied_to_budget
+    checkpoint.drop_resume(record.folder / "checkpoints", but_newest=more)
 
 
 def _result(record: RunRecord, status: str) -> Result:

@@ -26,7 +26,10 @@ def test_no_two_parts_of_any_two_runs_have_the_same_randomness():
 def test_an_iteration_compiles_nothing_that_was_compiled_ahead(monkeypatch, tmp_path):
     """Neither a run's first one, nor the one that goes on from a checkpoint."""
     monkeypatch.setattr(registry, "TASKS", (*registry.TASKS, WIDE_CORRIDOR))
-    agent = Agent(registry.resolve(WIDE_CORRIDOR.id, "m6", "smoke"), WideCorridor())
+    config = registry.resolve(WIDE_CORRIDOR.id, "m6", "smoke")
+    assert not config.tied_to_budget
+    object.__setattr__(config, "protocol", None)  # so that whoever reads the budget fails
+    agent = Agent(config, WideCorridor())
     key, ahead, compiled = start_key(0), Ahead(), []
     template = jax.eval_shape(agent.init, key)
     ahead.begin(first_programs(agent, template))

@@ -137,7 +137,8 @@ def test_mfrl_is_the_papers():
 def test_the_tables_leave_out_no_hyperparameter():
     """A new field must be given its value for the paper here, or be named as no hyperparameter."""
     elsewhere = {"task", "agent", "preset", "seed", "environment.burn_in_start", "policy.compute_type"}
-    elsewhere |= {"world_model.compute_type", "world_model.attention", "checkpoint.every_steps", "checkpoint.keep"}
+    elsewhere |= {"world_model.compute_type", "world_model.attention"}
+    elsewhere |= {"checkpoint.every_steps", "checkpoint.keep", "checkpoint.keep_resume"}
     covered = (MFRL_TABLE | TWM_TABLE | MBRL_TABLE | NOTES | MODEL_NOTES).keys()
     assert settings("m5").keys() - covered == elsewhere
 
@@ -386,3 +387,12 @@ def test_minatar_differs_from_craftax_in_what_the_paper_says_and_in_nothing_else
 def test_a_memory_only_where_something_is_hidden(game, memory):
     for preset in ("paper", "small", "smoke"):
         assert bool(registry.resolve(f"openspiel/{game}", "m5", preset).policy.rnn_size) == memory
+
+
+def test_which_agents_are_tied_to_their_budget():
+    """All others can be given more steps when they have finished."""
+    tied = {id: registry.resolve("craftax_classic", id, "paper").tied_to_budget for id in registry.agents()}
+    annealed = ("ppo.anneal_learning_rate=true",)
+    expected = dict.fromkeys(("mfrl", "mfrl_no_rnn", "mfrl_small"), annealed)
+    expected["m5_annealed"] = ("imagination.schedule=linear",)
+    assert {id: names for id, names in tied.items() if names} == expected

@@ -21,7 +21,9 @@ from leaderboards.results import finished_in
 from suite import registry
 from suite.agent.phases import Agent
 from suite.records import checkpoint
+from suite.records import record as record_module
 from suite.records.record import RunRecord
+from suite.records.tables import CsvTable
 from suite.runs import evaluation, training
 from suite.runs.saved_model import restore
 from suite.runtime.errors import RunError, UserError
@@ -60,6 +62,10 @@ class KillAt(StopAt):
             self.times -= 1
             if self.times == 0:
                 raise Killed
+
+
+def killed(*_):
+    raise Killed
 
 
 EVERYTHING = "world_model.optimizer=muon", "world_model.average=0.5"  # that a checkpoint of m5 may hold besides
@@ -191,7 +197,6 @@ def test_a_run_killed_while_it_ends_keeps_nothing_that_only_going_on_needs(tmp_p
     result = training.run(config(), tmp_path, QuietReporter())
     assert_same(result, uninterrupted)
     assert [path.name for path in (result.folder / "checkpoints").iterdir()] == ["step_000000000192"]
-    assert not any((result.folder / "checkpoints").glob("*/resume"))
 
 
 def test_a_final_evaluation_of_which_rows_are_missing_is_played_again(copied, uninterrupted):
@@ -291,6 +296,71 @@ def test_a_terminal_that_is_gone_cannot_be_told_and_the_run_stops_all_the_same(t
     assert checkpoint.latest_step(result.folder / "checkpoints") == 32
 
 
+@pytest.mark.parametrize("budget", [100, 160])
+def test_a_finished_run_takes_more_steps_as_if_it_had_had_them_from_the_start(tmp_path, uninterrupted, budget):
+    first = training.run(config("m5", f"protocol.steps={budget}"), tmp_path, QuietReporter())
+    assert first.status == "finished" and first.steps == budget // 32 * 32
+    assert [path.name for path in (first.folder / "checkpoints").iterdir()] == [f"step_{first.steps:012d}"]
+    with pytest.raises(Killed):
+        training.run(config(), tmp_path, KillAt("imagine", 1))
+    result = training.run(config(), tmp_path, QuietReporter())
+    assert_same(result, uninterrupted)
+    fields, others = (json.loads((run.folder / "record.json").read_text()) for run in (result, uninterrupted))
+    assert [more["step"] for more in fields["resumed"]] == [first.steps] * 2
+    for name in ("config_digest", "protocol", "protocol_hash", "status", "steps"):
+        assert fields[name] == others[name]
+    aside = result.folder / "replaced" / f"0001_with_{budget}_steps" / "evaluations.csv"
+    assert set(pd.read_csv(aside)["step"]) == {first.steps}
+    assert training.run(config(), tmp_path, QuietReporter()).status == "already finished"
+    with pytest.raises(UserError, match=f"holds a run with protocol.steps=192, not {budget}; choose another --out"):
+        training.run(config("m5", f"protocol.steps={budget}"), tmp_path, QuietReporter())
+
+
+def test_of_a_run_with_more_steps_only_planned_evaluations_stay(tmp_path):
+    evaluated = "evaluation.every_steps=64", "evaluation.episodes=1"
+    folders = []
+    for budgets in ((64, 96, 128, 140), (140,)):
+        for steps in budgets:
+            settings = config("random", *evaluated, f"protocol.steps={steps}")
+            result = training.run(settings, tmp_path / str(len(budgets)), QuietReporter())
+            assert result.status == "finished"
+        folders.append(result.folder)
+    assert files(folders[0]) == files(folders[1])
+    assert list(pd.read_csv(folders[0] / "evaluations.csv")["step"].unique()) == [64, 128]
+
+
+@pytest.mark.parametrize("before", [True, False], ids=["before", "after"])
+def test_a_run_killed_while_it_was_given_more_steps_has_the_old_ones_or_the_new(tmp_path, monkeypatch, before):
+    less = config("random", "protocol.steps=96")
+    folder = training.run(less, tmp_path, QuietReporter()).folder
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        if before:
+            patch.setattr(CsvTable, "set_aside", killed)
+        else:
+            calls = []
+            patch.setattr(record_module, "_settle_config", lambda *args: killed() if calls else calls.append(args))
+        training.run(config("random"), tmp_path, QuietReporter())
+    record = RunRecord.open(folder, lock=False)
+    assert (record.finished, record.config.protocol.steps) == ((True, 96) if before else (False, 192))
+    if before:
+        assert training.run(less, tmp_path, QuietReporter()).status == "already finished"
+    more = training.run(config("random"), tmp_path, QuietReporter())
+    whole = training.run(config("random"), tmp_path / "whole", QuietReporter())
+    assert files(more.folder) == files(whole.folder)
+
+
+def test_a_run_that_was_told_to_keep_less_takes_no_more_steps(tmp_path):
+    folder = training.run(config("random", "protocol.steps=64"), tmp_path, QuietReporter()).folder
+    assert list(folder.glob("checkpoints/*/resume"))
+    lean = "protocol.steps=64", "checkpoint.keep_resume=false"
+    assert training.run(config("random", *lean), tmp_path, QuietReporter()).status == "already finished"
+    assert not list(folder.glob("checkpoints/*/resume"))
+    before = files(folder)
+    with pytest.raises(UserError, match=r"finished after protocol\.steps=64 and did not keep what more steps"):
+        training.run(config("random"), tmp_path, QuietReporter())
+    assert files(folder) == before
+
+
 def test_records_are_complete(uninterrupted):
     fields = json.loads((uninterrupted.folder / "record.json").read_text())
     assert fields["status"] == "finished"
@@ -305,7 +375,7 @@ def test_records_are_complete(uninterrupted):
     episodes = pd.read_csv(uninterrupted.folder / "episodes.csv")
     assert (episodes["return"] == episodes["arrive"]).all()
     assert (episodes["length"] <= 6).all()
-    assert not (uninterrupted.folder / "checkpoints" / "step_000000000192" / "resume").exists()
+    assert [path.name for path in uninterrupted.folder.glob("checkpoints/*")] == ["step_000000000192"]
 
 
 def test_the_first_episodes_of_an_evaluation_are_whole(tmp_path, uninterrupted):
@@ -361,6 +431,13 @@ def test_without_a_world_model_nothing_of_it_exists(tmp_path):
     columns = pd.read_csv(result.folder / "metrics.csv").columns
     assert not any(name.startswith(("tokenizer", "world_model", "imagine")) for name in columns)
     assert "learn/entropy" in columns
+    # Its learning rate goes by the budget, so it takes no more steps and keeps nothing for them.
+    assert not list(result.folder.glob("checkpoints/*/resume"))
+    before = files(result.folder)
+    tied = "192, not 256, and what it learned depends on the budget, by ppo.anneal_learning_rate=true; choose"
+    with pytest.raises(UserError, match=tied):
+        training.run(config("mfrl", "protocol.steps=256"), tmp_path, QuietReporter())
+    assert files(result.folder) == before
 
 
 def test_random_learns_nothing(tmp_path):
