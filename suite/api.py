@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,9 @@ from suite.interface.batching import Batched
 from suite.interface.environment import EnvironmentSpec
 from suite.policy.actor_critic import mask_logits
 from suite.records.record import RunRecord
-from suite.runs import training
+from suite.runs import evaluation, training
 from suite.runs.saved_model import RestoredRun, restore
-from suite.runs.training import Callback
+from suite.runs.training import Callback, Result
 from suite.runtime.compilation import device_kind, enable_compilation_cache, quiet_xla, refuse_other_arithmetic
 from suite.runtime.errors import UserError
 from suite.runtime.reporting import QuietReporter, Reporter, RichReporter
@@ -56,21 +56,25 @@ def train(
     *,
     seed: int = 0,
     steps: int | None = None,
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | Sequence[str] | None = None,
     out: str | Path = "runs",
+    resume: bool = False,
     callbacks: Iterable[Callback] = (),
+    wandb: str | None = None,
     progress: bool = False,
 ) -> Run:
-    """Trains an agent, or goes on with a run that was stopped: what `suite run` does.
+    """Trains an agent, or goes on with a run that was stopped: `suite run` calls this for each seed.
 
     Args:
       task, agent, preset: ids; None: as `suite run` without that word.
       seed: of all randomness.
-      steps: real environment steps; None: the preset's.
-      settings: fields by dotted name, such as {"ppo.discount": 0.95}.
+      steps: real environment steps; None: the preset's. With more of them a finished run goes on.
+      settings: fields by dotted name, such as {"ppo.discount": 0.95}, or as words, such as ["ppo.discount=0.95"].
       out: the folder of all runs.
+      resume: insist that there is a run to go on with.
       callbacks: each is called after every iteration with what it left (`suite.runs.training.Iteration`). If one
         returns True, the run stops with a checkpoint, and the same call goes on with it.
+      wandb: the project at Weights & Biases that gets curves, beside TensorBoard's; None: it gets none.
       progress: whether progress is shown.
 
     Raises:
@@ -78,9 +82,9 @@ def train(
       RunError: the run cannot go on.
     """
     _begin()
-    config = registry.resolve(task, agent, preset, settings or {}, seed, steps)
-    reporter: Reporter = RichReporter() if progress else QuietReporter()
-    return load(training.run(config, Path(out), reporter, callbacks=tuple(callbacks)).folder)
+    config = registry.resolve(task, agent, preset, settings or (), seed, steps)
+    result = training.run(config, Path(out), _reporter(progress), resume, callbacks=tuple(callbacks), wandb=wandb)
+    return Run(RunRecord.open(result.folder, lock=False), result)
 
 
 def load(folder: str | Path) -> Run:
@@ -110,8 +114,8 @@ def results(*folders: str | Path) -> pd.DataFrame:
 class Run:
     """One run: its record as data frames, and the newest checkpoint's policy, world model and tokenizer."""
 
-    def __init__(self, record: RunRecord):
-        self._record = record
+    def __init__(self, record: RunRecord, result: Result | None = None):
+        self._record, self._result = record, result
 
     def __repr__(self) -> str:
         return f"Run({str(self.folder)!r}, {self.status} at step {self.steps:,})"
@@ -162,11 +166,31 @@ class Run:
         return self._record.table("timing")
 
     @functools.cached_property
+    def result(self) -> Result:
+        """What it came to, as `suite run` prints it. Its status is "already finished" if `train` had nothing to do."""
+        return self._result or training.result_of(self._record, self.status)
+
+    @functools.cached_property
     def scores(self) -> dict[str, float]:
         """By name, computed from the training episodes as the task says."""
         score = registry.task(self.config.task).scores()
         found = score(self._record.episodes(), self.config, self.spec)
         return {name: value for name, value in found.items() if name not in COUNTS}
+
+    def evaluate(self, episodes: int | None = None, *, progress: bool = False) -> dict[str, Any]:
+        """Plays whole episodes with the newest checkpoint and records them: what `suite evaluate` does.
+
+        Args:
+          episodes: at least so many; None: the run's setting.
+          progress: whether progress is shown.
+
+        Returns:
+          the task's scores over them, their number ("episodes") and the checkpoint's "step".
+
+        Raises:
+          UserError: there is no usable checkpoint, or the run is in use.
+        """
+        return evaluation.evaluate(self.folder, episodes, _reporter(progress))
 
     @functools.cached_property
     def _restored(self) -> RestoredRun:
@@ -406,6 +430,10 @@ def _batch(array: np.ndarray, shape: tuple[int, ...], name: str) -> tuple[jax.Ar
     if found.dtype.kind not in "bui":
         raise UserError(f"{name}: numbers of type {found.dtype}, expected whole ones, as the task shows them (uint8)")
     return jnp.asarray(found[None] if alone else found, jnp.uint8), alone
+
+
+def _reporter(progress: bool) -> Reporter:
+    return RichReporter() if progress else QuietReporter()
 
 
 def _begin() -> None:

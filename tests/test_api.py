@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 
@@ -15,7 +16,7 @@ import pytest
 from PIL import Image
 
 import suite
-from suite import registry
+from suite import api, registry
 from suite.diagnostics.watching import Episode, captions
 from suite.records.record import RunRecord, run_folder
 from suite.runs.training import Iteration
@@ -67,6 +68,18 @@ def test_what_a_run_leaves(trained):
     }
     again = suite.load(run.folder)
     assert again.scores == run.scores and "finished at step" in repr(again)
+    assert run.result.status == again.result.status == "finished" and again.result.evaluation == run.result.evaluation
+
+
+def test_an_evaluation_is_that_of_the_command(trained, suite, tmp_path):
+    copies = [shutil.copytree(trained[0].folder, tmp_path / name) for name in ("first", "second")]
+    scores = api.load(copies[0]).evaluate(3)
+    assert scores["episodes"] >= 3 and scores["step"] == trained[0].steps
+    code, out, _ = suite("evaluate", copies[1], "--episodes", "3", "--quiet", "--json")
+    assert code == 0
+    assert json.loads(out.splitlines()[-1]) == {"folder": str(copies[1]), **scores}
+    first, second = ((folder / "evaluations.csv").read_bytes() for folder in copies)
+    assert first == second
 
 
 def test_results_are_a_table_of_finished_runs(trained):

@@ -34,6 +34,21 @@ def whole(least: int, most: int = MOST) -> Callable[[str], int]:
     return parse
 
 
+def add_wandb(parser: argparse.ArgumentParser) -> None:
+    """The option for curves at Weights & Biases."""
+    parser.add_argument(
+        "--wandb", metavar="PROJECT", help="curves at Weights & Biases too (offline: WANDB_MODE=offline)"
+    )
+
+
+def require_wandb_of(args: argparse.Namespace) -> None:
+    """Raises a UserError if it is asked for and not installed."""
+    if args.wandb is not None:
+        from suite.records.wandb_runs import require_wandb
+
+        require_wandb()
+
+
 def parse_seeds(text: str) -> list[int]:
     """Seeds of "0-2" or "0,3,5", or of both mixed."""
     seeds: list[int] = []

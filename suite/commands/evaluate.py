@@ -21,7 +21,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     from suite import registry
-    from suite.records.record import RunRecord
 
     if args.policy:
         from suite.runs.external import evaluate_policy
@@ -34,11 +33,10 @@ def execute(args: argparse.Namespace) -> int:
     folder = Path(args.what)
     if not folder.exists() and args.what in registry.tasks():
         raise UserError(f"{args.what} is a task: say whose policy to play it with, --policy module:Class")
-    RunRecord.open(folder, lock=False)
 
-    from suite.runs import evaluation
+    from suite import api
 
-    scores = evaluation.evaluate(folder, args.episodes, make_reporter(args.quiet))
+    scores = api.load(folder).evaluate(args.episodes, progress=not args.quiet)
     print_scores(scores)
     print(f"record {folder}")
     if args.json:

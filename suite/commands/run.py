@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from suite.commands.configuration import add_configuration, parse_seeds
-from suite.commands.printing import device_name, make_reporter, print_json, print_scores, score_line
+from suite.commands.configuration import add_configuration, add_wandb, parse_seeds, require_wandb_of
+from suite.commands.printing import device_name, print_json, print_scores, score_line
 from suite.interface.scores import ScoreName
 from suite.runtime.errors import UserError
 
@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     seeds.add_argument("--seed", type=int, default=0, metavar="N", help="of all randomness (default 0)")
     seeds.add_argument("--seeds", type=parse_seeds, metavar="N-M", help="several, one after another: 0-2 or 0,3,5")
     parser.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where records go (default runs)")
+    add_wandb(parser)
     parser.add_argument("--resume", action="store_true", help="fail if there is no run to go on with")
     parser.add_argument("--quiet", action="store_true", help="no progress")
 
@@ -39,19 +40,31 @@ def execute(args: argparse.Namespace) -> int:
     begun = [(folder / "record.json").exists() for folder in folders]
     if args.resume and not any(begun):
         raise UserError(f"nothing to resume in {folders[0]}: run without --resume to start there")
+    require_wandb_of(args)
     require_writable(args.out)
     for folder, config, exists in zip(folders, configs, begun, strict=True):
         if exists:  # so that the last seed's folder is known to be right before the first one's run starts
             RunRecord.open(folder, config, lock=False)
 
-    from suite.runs import training
+    from suite import api
 
     results: list[Result] = []
     for folder, config, exists in zip(folders, configs, begun, strict=True):
         if not args.quiet:
             what = f"{config.task}, agent {config.agent}, preset {config.preset}, seed {config.seed}"
             print(f"{what}, on {device_name()}; files in {folder}", flush=True)
-        result = training.run(config, args.out, make_reporter(args.quiet), args.resume and exists)
+        result = api.train(
+            args.task,
+            args.agent,
+            args.preset,
+            seed=config.seed,
+            steps=args.steps,
+            settings=args.overrides,
+            out=args.out,
+            resume=args.resume and exists,
+            wandb=args.wandb,
+            progress=not args.quiet,
+        ).result
         results.append(result)
         _print_result(result)
         if result.status == "stopped":

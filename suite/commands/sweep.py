@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from suite.commands.configuration import parse_seeds, whole
+from suite.commands.configuration import add_wandb, parse_seeds, require_wandb_of, whole
 from suite.commands.printing import print_json, print_table, score_line
 from suite.runtime.errors import UserError
 
@@ -48,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--retries", type=whole(0), metavar="N", help="of a run that failed or died (default: 2 if it died, else 0)"
     )
+    add_wandb(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress")
     parser.add_argument(
         "overrides", nargs="*", default=[], metavar="dotted.name=value", help="any field that `suite describe` shows"
@@ -64,6 +65,7 @@ def execute(args: argparse.Namespace) -> int:
         raise UserError(f"{'--address' if args.address else '--gpus'} is Ray's: add --engine ray")
     if on_ray:
         _require_ray()
+    require_wandb_of(args)
 
     from suite.runs import sweep
 
@@ -72,7 +74,7 @@ def execute(args: argparse.Namespace) -> int:
         from suite.runs.sweep_ray import compute_types
 
         overrides, out = [*compute_types(args.gpus or 0), *overrides], out.absolute()
-    runs = sweep.plan(args.tasks, args.agents, args.seeds, args.preset, overrides, args.steps, out)
+    runs = sweep.plan(args.tasks, args.agents, args.seeds, args.preset, overrides, args.steps, out, args.wandb)
     if any(run.status == "waiting" for run in runs):
         with _engine(args) as (start, jobs, where):
             if not args.quiet:

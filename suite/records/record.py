@@ -8,7 +8,7 @@
     metrics.csv       one row per iteration
     evaluations.csv   one row per evaluation episode; never mixed with training's
     timing.csv        seconds per phase, one row per iteration (of evaluations, record.json has the sum)
-    tensorboard/      the metrics as curves
+    tensorboard/      the metrics as curves; wandb/ for Weights & Biases, where it was asked for
     checkpoints/      see `suite.records.checkpoint`
     replaced/         rows of iterations that a resumed run played again, and of last evaluations that no longer are
 
@@ -17,12 +17,13 @@ No clock enters episodes.csv and metrics.csv, so that a run that was stopped and
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import os
 import tempfile
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, Protocol
 
 from pydantic import ValidationError
 
@@ -41,6 +42,16 @@ if TYPE_CHECKING:
     from suite.interface.environment import EnvironmentSpec
 
 NEXT_CONFIG = "config.next.json"  # of a run that is being given more steps, until its record says that it has them
+
+
+class Curves(Protocol):
+    """Where the numbers of each iteration become curves."""
+
+    def append(self, step: int, values: Mapping[str, float]) -> None:
+        """One point on each curve."""
+
+    def close(self) -> None:
+        """No more will come."""
 
 
 def run_folder(out: Path, config: Config) -> Path:
@@ -96,7 +107,8 @@ class RunRecord:
         self._tables = {
             name: CsvTable(folder / f"{name}.csv", columns) for name, columns in fields.columns.items() if lock
         }
-        self._events: Any = None
+        self._curves: list[Curves] = []
+        self._events: Curves | None = None  # TensorBoard's
         self._purge_step: int | None = None
         self._new = self._all_counted = False
 
@@ -238,8 +250,14 @@ class RunRecord:
         self.fields.steps = int(row["step"])
         if self._events is None:
             self._events = EventFile(self.folder / "tensorboard", self._purge_step)
+            self._curves.append(self._events)
         numbers = {name: float(value) for name, value in row.items() if value is not None and name != "step"}
-        self._events.append(int(row["step"]), numbers)
+        for curves in self._curves:
+            curves.append(int(row["step"]), numbers)
+
+    def draw_curves_at(self, curves: Curves) -> None:
+        """Every iteration's metrics go there too, until the record is closed."""
+        self._curves.append(curves)
 
     def append_timing(self, row: Mapping[str, Any]) -> None:
         """Adds one iteration's seconds per phase, `step` first. The first row fixes the columns."""
@@ -367,13 +385,12 @@ class RunRecord:
 
     def close(self) -> None:
         """Lets other processes open the folder."""
-        events, lock, self._events, self._lock = self._events, self._lock, None, None
-        try:
-            if events is not None:
-                events.close()
-        finally:
+        curves, lock, self._curves, self._events, self._lock = self._curves, self._lock, [], None, None
+        with contextlib.ExitStack() as stack:  # all of them, whatever one of them raises, and the lock last
             if lock is not None:
-                lock.close()
+                stack.callback(lock.close)
+            for each in curves:
+                stack.callback(each.close)
 
     def __enter__(self) -> RunRecord:
         return self

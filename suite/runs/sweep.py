@@ -124,6 +124,7 @@ def plan(
     overrides: Sequence[str] = (),
     steps: int | None = None,
     out: Path = Path("runs"),
+    wandb: str | None = None,
 ) -> list[Run]:
     """All runs of a sweep, each once, finished ones marked; nothing but the folder `out` is made.
 
@@ -132,12 +133,14 @@ def plan(
       agents: likewise.
       seeds, preset, overrides, steps: as in `suite.registry.resolve`.
       out: the folder of all runs.
+      wandb: the project at Weights & Biases that gets curves; None: it gets none.
 
     Raises:
       UserError: an unknown id, field or value in any of them, a folder that holds another run or cannot be written.
     """
     runs: dict[Path, Run] = {}
-    steps_words = [] if steps is None else ["--steps", str(steps)]
+    options = {"--steps": steps, "--wandb": wandb}
+    more = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     agent_ids = _select("--agents", agents, registry.agents())
     with _device_memory_left_alone():
         for task in _select("--tasks", tasks, registry.tasks()):
@@ -149,7 +152,7 @@ def plan(
                     except UserError as error:
                         raise UserError(f"{task}, agent {agent.id}: {error}") from error
                     words = ["run", task, "--agent", agent.id, "--preset", config.preset, "--seed", str(seed)]
-                    words += ["--out", str(out), *steps_words, *overrides, "--json"]
+                    words += ["--out", str(out), *more, *overrides, "--json"]
                     folder = run_folder(out, config)
                     runs[folder] = run = Run(config, folder, words)
                     if (folder / "record.json").exists():

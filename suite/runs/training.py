@@ -21,6 +21,7 @@ from suite.configuration.schema import Config
 from suite.interface.environment import EnvironmentSpec
 from suite.records import checkpoint
 from suite.records.record import RunRecord, run_folder
+from suite.records.wandb_runs import WandbRun, require_wandb
 from suite.runs.evaluation import episode_rows, record_evaluation
 from suite.runs.saved_model import Remainder, SavedModel, agent_for
 from suite.runtime.compilation import Ahead
@@ -38,7 +39,7 @@ class Result:
 
     Attributes:
       folder: where its record is.
-      status: "finished", "stopped" (by a signal) or "already finished".
+      status: "finished", "stopped" (by a signal or a callback) or "already finished".
       steps: real steps taken.
       wall_seconds: of all its processes.
       scores: by name, from its training episodes.
@@ -72,7 +73,12 @@ Callback = Callable[[Iteration], bool | None]
 
 
 def run(
-    config: Config, out: Path, reporter: Reporter, resume: bool = False, callbacks: Sequence[Callback] = ()
+    config: Config,
+    out: Path,
+    reporter: Reporter,
+    resume: bool = False,
+    callbacks: Sequence[Callback] = (),
+    wandb: str | None = None,
 ) -> Result:
     """Trains one agent on one task, or goes on where an earlier call of the same command stopped.
 
@@ -82,19 +88,27 @@ def run(
       reporter: where progress goes.
       resume: insist that there is a run to go on with.
       callbacks: called after each iteration; if one returns True, the run stops with a checkpoint.
+      wandb: the project at Weights & Biases that gets curves, beside TensorBoard's; None: it gets none.
 
     Raises:
-      UserError: before anything is compiled: the folder cannot be written, is in use, or holds another run.
+      UserError: before anything is compiled: the folder cannot be written, is in use, or holds another run; or Weights
+        & Biases cannot be used.
       RunError: the loss diverged or the disk is full; the last good checkpoint stays.
     """
     entry = registry.task(config.task)
     folder = run_folder(out, config)
     if resume and not (folder / "record.json").exists():
         raise UserError(f"nothing to resume in {folder}: run without --resume to start there")
+    if wandb is not None:
+        require_wandb()
     with refusals_are_errors(), RunRecord.open_or_create(folder, config, entry.spec()) as record:
         if record.finished:
             _forget(record)  # a kill may have come before, or more was kept until now
-            return _result(record, "already finished")
+            return result_of(record, "already finished")
+        if wandb is not None:
+            there = WandbRun(folder, config, wandb)
+            record.draw_curves_at(there)
+            reporter.message(f"Weights & Biases: {there.place}")
         return _Training(config, agent_for(config, reporter), record, reporter, callbacks).run()
 
 
@@ -180,7 +194,7 @@ class _Training:
             self.ahead.close()
             self.reporter.stop()
             self.record.add_wall_clock(time.monotonic() - started, self.seconds)
-        return _result(self.record, "finished" if self.record.finished else "stopped")
+        return result_of(self.record, "finished" if self.record.finished else "stopped")
 
     def _passed(self, before: int, every: int) -> bool:
         """Whether the last iteration, begun at step `before`, reached another multiple of `every` (0: of nothing)."""
@@ -331,7 +345,8 @@ def _forget(record: RunRecord) -> None:
     checkpoint.drop_resume(record.folder / "checkpoints", but_newest=more)
 
 
-def _result(record: RunRecord, status: str) -> Result:
+def result_of(record: RunRecord, status: str) -> Result:
+    """What a run came to so far."""
     score = registry.task(record.config.task).scores()
     scores = score(record.episodes(), record.config, record.spec)
     evaluations = record.table("evaluations")

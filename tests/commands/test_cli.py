@@ -184,10 +184,12 @@ def fake_run(monkeypatch):
     """Replaces training; seed n scores n more. The calls so far, and what was put in place."""
     calls = []
 
-    def result(config, out, reporter, resume, status="finished", scores=SCORES):
+    def result(config, out, reporter, resume, callbacks, wandb, status="finished", scores=SCORES):
         calls.append((config, out, resume))
         scores = {name: value + config.seed for name, value in scores.items()}
-        return Result(run_folder(out, config), status, config.total_steps, 1.5, scores)
+        folder = run_folder(out, config)
+        RunRecord.open_or_create(folder, config, task(config.task).spec()).close()
+        return Result(folder, status, config.total_steps, 1.5, scores)
 
     monkeypatch.setattr(training, "run", result)
     return calls, result
@@ -240,13 +242,13 @@ def test_no_episode_yet_is_said_and_null(suite, fake_run, monkeypatch):
     nan = float("nan")
     result = fake_run[1]
     none = {"reward_percent": nan, "score_percent": nan, "episodes": 0}
-    monkeypatch.setattr(training, "run", lambda *args: result(*args, scores=none))
+    monkeypatch.setattr(training, "run", lambda *args, **options: result(*args, **options, scores=none))
     _, out, _ = suite("run", *SMOKE, "--quiet", "--json")
     lines = out.splitlines()
     assert lines[:2] == ["reward n/a, no episode ended yet", "score n/a, no episode ended yet"]
     assert json.loads(lines[-1])["scores"] == {"reward_percent": None, "score_percent": None, "episodes": 0}
     early = {"reward_percent": nan, "score_percent": 3.0, "episodes": 4}
-    monkeypatch.setattr(training, "run", lambda *args: result(*args, scores=early))
+    monkeypatch.setattr(training, "run", lambda *args, **options: result(*args, **options, scores=early))
     _, out, _ = suite("run", *SMOKE, "--seeds", "0-1", "--quiet", "--json")
     lines = out.splitlines()
     assert lines[:2] == ["reward n/a, no episode ended in the part that counts", "score 3 %"]
@@ -257,7 +259,7 @@ def test_no_episode_yet_is_said_and_null(suite, fake_run, monkeypatch):
 
 def test_a_stopped_run_stops_the_seeds(suite, fake_run, monkeypatch):
     result = fake_run[1]
-    monkeypatch.setattr(training, "run", lambda *args: result(*args, status="stopped"))
+    monkeypatch.setattr(training, "run", lambda *args, **options: result(*args, **options, status="stopped"))
     code, out, _ = suite("run", *SMOKE, "--seeds", "0-4", "--quiet")
     assert code == 130
     assert len(fake_run[0]) == 1
@@ -271,7 +273,7 @@ def test_resume_insists_on_what_was_begun_only(suite, fake_run, folder):
 
 
 def test_a_run_that_cannot_go_on_exits_with_1(suite, monkeypatch):
-    def diverge(*args):
+    def diverge(*args, **options):
         raise RunError("loss became nan\nin phase learn")
 
     monkeypatch.setattr(training, "run", diverge)
@@ -280,7 +282,7 @@ def test_a_run_that_cannot_go_on_exits_with_1(suite, monkeypatch):
 
 
 def test_an_interrupt_exits_with_130(suite, monkeypatch):
-    def interrupt(*args):
+    def interrupt(*args, **options):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(training, "run", interrupt)

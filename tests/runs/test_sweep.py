@@ -17,6 +17,7 @@ from suite.commands import sweep as command
 from suite.records.record import RunRecord
 from suite.runs import sweep
 from suite.runs.sweep import Outcome, Process, log_of, plan
+from suite.runtime.errors import UserError
 from tests.runs.sweeping import (
     GRID,
     alive,
@@ -109,9 +110,21 @@ def test_the_folder_of_another_run(suite, monkeypatch):
     with RunRecord.create(run.folder, run.config, sweep.registry.task(run.config.task).spec()):
         pass
     monkeypatch.setattr(sweep, "Process", None)
-    code, _, err = suite(*ONE, "--seeds", "0-1", "--steps", 960)
-    assert code == 2 and "holds a run with protocol.steps=96, not 960; choose another --out" in err
+    code, _, err = suite(*ONE, "--seeds", "0-1", "--steps", 64)
+    assert code == 2 and "holds a run with protocol.steps=96, not 64; choose another --out" in err
     assert len(records()) == 1
+
+
+def test_finished_runs_are_given_more_steps():
+    (run,) = plan("openspiel/tic_tac_toe", "random", [0], "smoke")
+    with RunRecord.create(run.folder, run.config, sweep.registry.task(run.config.task).spec()) as record:
+        record.append_metrics({"step": 96, "episodes": 0})
+        record.finish(96)
+    assert [run.status for run in plan("openspiel/tic_tac_toe", "random", [0], "smoke")] == ["already finished"]
+    with pytest.raises(UserError, match="did not keep what more steps need"):
+        plan("openspiel/tic_tac_toe", "random", [0], "smoke", steps=960)
+    (run.folder / "checkpoints" / "step_000000000096" / "resume").mkdir(parents=True)
+    assert [run.status for run in plan("openspiel/tic_tac_toe", "random", [0], "smoke", steps=960)] == ["waiting"]
 
 
 # What is planned and shown.
