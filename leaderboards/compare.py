@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from leaderboards.results import Entry, entries_of
@@ -13,6 +16,7 @@ from leaderboards.scoring import main_score
 from leaderboards.statistics import mean_and_standard_error
 from suite.interface.scores import ScoreName
 from suite.records.record import RunRecord
+from suite.records.tables import write_whole
 from suite.runtime.errors import UserError, did_you_mean
 
 Estimate = tuple[float, float]  # mean and standard error; nan where there is none
@@ -107,6 +111,45 @@ def tables(comparison: Comparison) -> list[pd.DataFrame]:
             | dict(zip(ends, map(_text, comparison.curve[agent]), strict=True))
         )
     return [pd.DataFrame(scores), pd.DataFrame(curve)]
+
+
+def require_plot(path: Path) -> None:
+    """Raises a UserError if no plot can be written there."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    kinds = sorted(FigureCanvasBase.get_supported_filetypes())
+    if path.suffix[1:].lower() not in kinds:
+        raise UserError(f"cannot draw {path}: its name must end in one of {', '.join(f'.{kind}' for kind in kinds)}")
+    if not path.parent.is_dir():
+        raise UserError(f"cannot write {path}: {path.parent} is no folder")
+
+
+def plot(path: Path, comparisons: Sequence[Comparison]) -> None:
+    """Draws the curves: mean over seeds, and around it a band of one standard error where there are several.
+
+    Args:
+      path: of the picture, whose ending says its kind; see `require_plot`.
+      comparisons: each a panel.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4 * len(comparisons)), layout="constrained")
+    panels = figure.subplots(len(comparisons), squeeze=False)[:, 0]
+    for axes, comparison in zip(panels, comparisons, strict=True):
+        for agent, curve in comparison.curve.items():
+            steps_P = (np.arange(len(curve)) + 1) * comparison.steps / len(curve)
+            mean_P, error_P = np.array(curve).T
+            (line,) = axes.plot(steps_P, mean_P, label=f"{agent} ({comparison.seeds[agent]})")
+            axes.fill_between(steps_P, mean_P - error_P, mean_P + error_P, color=line.get_color(), alpha=0.2, lw=0)
+        axes.set_title(f"{comparison.task}, preset {comparison.preset}")
+        axes.set_xlabel("real environment steps")
+        axes.set_ylabel(ScoreName(comparison.curve_of).heading)
+        axes.set_xlim(0, comparison.steps)
+        axes.grid(alpha=0.3)
+        axes.legend(title="agent (seeds)", frameon=False)
+    content = io.BytesIO()
+    figure.savefig(content, format=path.suffix[1:].lower(), dpi=150)
+    write_whole(path, content.getvalue())
 
 
 def _text(value: Estimate) -> str:

@@ -157,6 +157,7 @@ class _Training:
         self.checkpoints = record.folder / "checkpoints"
         self.iteration = self.steps = 0
         self.log = IterationLog(agent.spec, 0)  # of the present iteration
+        self.unlocked: set[str] = set()  # achievements, in any episode so far
         self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
         self.recorded_seconds: dict[str, float] = {}  # of those, what timing.csv has
         self.stop_requested = self.stop_now = self.saving = False
@@ -224,6 +225,8 @@ class _Training:
             )
         self.record.rewind(self.steps)
         self._extend()
+        achievements = self.record.episodes()[list(self.agent.spec.achievements)]
+        self.unlocked.update(achievements.columns[achievements.any()])
         self.reporter.message(f"resuming at step {self.steps:,}")
         if not self.done:
             self.ahead.begin(first_programs(self.agent, template))
@@ -248,7 +251,11 @@ class _Training:
         row = self.log.row()
         self.record.append_metrics(row, self.agent.metric_names)
         self._record_timing()
-        self.reporter.update(self.steps, "", {} if row["return"] is None else {"return": row["return"]})
+        self.unlocked.update(name for name in self.agent.spec.achievements if any(row[name] for row in self.log.rows))
+        shown = {} if row["return"] is None else {"return": row["return"]}
+        if self.agent.spec.achievements:
+            shown["achievements"] = len(self.unlocked)
+        self.reporter.update(self.steps, "", shown)
         for callback in self.callbacks:
             if callback(Iteration(self.steps, row, self.log.rows)):
                 self.stop_requested = True

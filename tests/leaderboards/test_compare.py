@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 
 from leaderboards.compare import compare, tables
 from leaderboards.results import finished_in
@@ -13,6 +15,7 @@ from suite.records.record import RunRecord, run_folder
 from suite.registry import resolve, task
 from suite.runtime.errors import UserError
 
+savefig = Figure.savefig
 SPEC = task("craftax_classic").spec()
 
 
@@ -61,6 +64,36 @@ def test_the_command_prints_markdown(write, tmp_path, capsys):
     assert lines[4].startswith("| m5 | 2 | 75.00 +- 25.00 | 70.91 +- 25.00 |")
     assert lines[6] == "| reward % with health, steps | to 32 | to 64 |"
     assert lines[8] == "| m5 | 0.455 +- 4.545 | 70.91 +- 25.00 |"
+
+
+def test_curves_are_drawn(write, tmp_path, suite, monkeypatch):
+    write("m5", 0, (0, 11))
+    write("m5", 1, (2, 22))
+    write("random", 0, (0, 0))
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *args, **kw: drawn.append(self) or savefig(self, *args, **kw))
+    path = tmp_path / "curves.png"
+    code, out, err = suite("compare", tmp_path, "--plot", path, "--parts", "2")
+    assert (code, err) == (0, "") and out.endswith(f"curves {path}\n")
+    (axes,) = drawn[0].axes
+    random, m5 = axes.lines
+    assert (random.get_label(), m5.get_label()) == ("random (1)", "m5 (2)")
+    assert m5.get_xdata().tolist() == [32, 64] and m5.get_ydata().tolist() == pytest.approx([100 / 22, 75])
+    band = axes.collections[1].get_paths()[0].get_extents()
+    assert (band.y0, band.y1) == pytest.approx((0, 100))  # 100 / 22 +- 100 / 22 at first, 75 +- 25 in the end
+    assert axes.get_ylabel() == "reward %"
+    with Image.open(path) as image:
+        assert image.width > 600
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("curves", "must end in"), ("curves.csv", ".png"), ("no/curves.png", "no is no folder")]
+)
+def test_what_cannot_be_drawn(write, tmp_path, suite, monkeypatch, name, message):
+    write("m5", 0, (0, 11))
+    monkeypatch.chdir(tmp_path)
+    code, out, err = suite("compare", "runs", "--plot", name)
+    assert (code, out) == (2, "") and message in err and err.count("\n") == 1
 
 
 def test_protocols_are_kept_apart(write, tmp_path):

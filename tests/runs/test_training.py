@@ -445,6 +445,27 @@ def test_random_learns_nothing(tmp_path):
     assert list(pd.read_csv(result.folder / "metrics.csv").columns) == ["step", "reward_per_step", "episodes", "return"]
 
 
+def test_achievements_are_counted_while_it_runs(tmp_path, monkeypatch):
+    shown = []
+
+    class Watcher(QuietReporter):
+        def update(self, steps, phase, fields):
+            if fields:
+                shown.append((steps, fields["achievements"]))
+
+    class NoneMore(training.IterationLog):
+        def add(self, phase, result):
+            values = super().add(phase, result)
+            self.rows = [row | {"arrive": 0} for row in self.rows]
+            return values
+
+    training.run(config("random"), tmp_path, Watcher(), callbacks=[lambda iteration: iteration.step == 96])
+    monkeypatch.setattr(training, "IterationLog", NoneMore)
+    episodes = training.run(config("random"), tmp_path, Watcher()).folder / "episodes.csv"
+    first = pd.read_csv(episodes).query("arrive == 1")["step"].min()
+    assert first <= 96 and shown == [(step, int(step >= first)) for step in (32, 64, 96, 128, 160, 192)]
+
+
 def test_seeds_differ(tmp_path):
     first, second = (training.run(config("random", seed=seed), tmp_path, QuietReporter()) for seed in (0, 1))
     assert files(first.folder)["episodes.csv"] != files(second.folder)["episodes.csv"]
