@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -13,6 +14,12 @@ def code(document: str, language: str, word: str) -> str:
     blocks = re.findall(rf"^```{language}\n(.*?)^```$", (REPOSITORY / document).read_text(), re.MULTILINE | re.DOTALL)
     (block,) = (block for block in blocks if word in block)
     return block
+
+
+def cells(notebook: str) -> list[str]:
+    """The code of a notebook, cell by cell."""
+    found = json.loads((REPOSITORY / notebook).read_text())["cells"]
+    return ["".join(cell["source"]) for cell in found if cell["cell_type"] == "code"]
 
 
 def command_lines(document: str) -> list[str]:

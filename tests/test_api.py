@@ -10,6 +10,7 @@ import sys
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -21,10 +22,12 @@ from suite.diagnostics.watching import Episode, captions
 from suite.records.record import RunRecord, run_folder
 from suite.runs.training import Iteration
 from suite.runtime.errors import UserError
+from tests import documents
 from tests.documents import code
 from tests.tiny import WIDE_CORRIDOR
 
 TASK = WIDE_CORRIDOR.id
+SETTINGS = {"imagination.trust": 0, "imagination.trust_window": 0, "ppo.discount": 0.9}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,11 +46,10 @@ def trained(tmp_path_factory):
         seen.append(iteration)
         return True
 
-    settings = {"imagination.trust": 0, "imagination.trust_window": 0, "ppo.discount": 0.9}
-    stopped = suite.train(TASK, "m6", "smoke", settings=settings, out=out, callbacks=[first])
+    stopped = suite.train(TASK, "m6", "smoke", settings=SETTINGS, out=out, callbacks=[first])
     assert (stopped.status, stopped.steps) == ("stopped", seen[0].step)
     assert stopped.policy.act(np.zeros((3, *stopped.spec.observation.shape), np.uint8)).shape == (3,)
-    run = suite.train(TASK, "m6", "smoke", settings=settings, out=str(out), callbacks=[seen.append])
+    run = suite.train(TASK, "m6", "smoke", settings=SETTINGS, out=str(out), callbacks=[seen.append])
     return run, seen
 
 
@@ -171,6 +173,27 @@ def test_bad_input_is_refused_before_anything_is_compiled(tmp_path):
 def test_nothing_is_imported_before_it_is_used():
     script = "import sys, suite; assert 'jax' not in sys.modules; suite.make; assert 'jax' in sys.modules"
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_the_notebook_runs(trained, tmp_path, capsys):
+    """All its cells, in order, on the task and with the agent that the tests before have compiled."""
+    settings, *cells = documents.cells("docs/tutorial.ipynb")
+    names: dict = {}
+    exec(settings, names)
+    steps = 2 * trained[0].config.steps_per_iteration
+    ours = {"TASK": TASK, "AGENT": "m6", "PRESET": "smoke", "STEPS": steps, "SETTINGS": SETTINGS, "OUT": tmp_path}
+    assert names.keys() - {"__builtins__"} == ours.keys() | {"SEED"}
+    names |= ours
+    with plt.ioff():
+        for cell in cells:
+            exec(cell, names)
+    pictures = [plt.figure(number) for number in plt.get_fignums()]
+    plt.close("all")
+    assert [len(picture.axes) for picture in pictures] == [2, 2 * names["HORIZON"]]
+    run = names["run"]
+    assert run.status == "finished" and len(run.metrics) == 2 + 1
+    assert names["dream"].frames.shape == names["real"].shape == (names["HORIZON"], *run.spec.observation.shape)
+    assert f"{names['HORIZON']} steps on: " in capsys.readouterr().out
 
 
 def test_the_example_in_the_documents_runs(tmp_path, monkeypatch, capsys):
