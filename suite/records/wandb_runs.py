@@ -58,12 +58,13 @@ class WandbRun:
                 settings=wandb.Settings(silent=True, console="off", disable_git=True),
             )
         except wandb.Error as error:
-            raise UserError(f"Weights & Biases: {error} WANDB_MODE=offline needs no account") from error
+            hint = "with WANDB_MODE=offline it needs neither account nor network"
+            raise UserError(f"Weights & Biases: {error} ({hint})") from error
 
     @property
     def place(self) -> str:
         """Where its curves are."""
-        return f"{self._run.dir}, for `wandb sync`" if self._run.offline else str(self._run.url)
+        return f"`wandb sync {Path(self._run.dir).parent}` uploads it" if self._run.offline else str(self._run.url)
 
     def append(self, step: int, values: Mapping[str, float]) -> None:
         """One point on each curve."""

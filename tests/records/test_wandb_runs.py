@@ -103,4 +103,4 @@ def test_without_an_account_one_line_says_so(suite, monkeypatch, tmp_path):
         monkeypatch.setenv(name, value)
     code, _, err = suite(*SMOKE)
     assert code == 2 and err.startswith("error: Weights & Biases: No API key") and err.count("\n") == 1
-    assert "WANDB_MODE=offline needs no account" in err
+    assert "with WANDB_MODE=offline it needs neither account nor network" in err
