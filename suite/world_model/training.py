@@ -140,6 +140,9 @@ def losses(
     """
     step_weight_BT, token_weight_BT = _weights(sequences, config.mask_after_done)
     lesson = model.factorization.lesson(sequences, token_weight_BT)
+    if dropout_key is not None and config.token_noise:
+        noisy_BFL = with_wrong_tokens(lesson.frame_BFL, config.token_noise, jax.random.fold_in(dropout_key, 1))
+        lesson = lesson.replace(frame_BFL=noisy_BFL)  # type: ignore[attr-defined]
     hidden_BFSD = model(lesson.frame_BFL, lesson.action_BF, dropout_key, lesson.history_BF)
     token_loss_BFL, correct_BFL, copied_BFL = _token_losses(model, hidden_BFSD, lesson.target_BFL, lesson.frame_BFL)
     changed_BFL = (lesson.before_BFL != lesson.target_BFL).reshape(*lesson.weight_BFL.shape, -1).any(-1)
@@ -174,6 +177,19 @@ def losses(
         turn_loss, turn_metrics = turn_losses(model.turn_logits(hidden_BTSD), following_turn_BT, token_weight_BT)
         loss, metrics = loss + turn_loss, metrics | turn_metrics
     return loss, metrics
+
+
+def with_wrong_tokens(frame_BFL: jax.Array, share: float, key: jax.Array) -> jax.Array:
+    """Frames of which a share of all tokens is that of the same place in some other sequence.
+
+    A dreamt frame is wrong at times: its tokens are drawn at each place by itself, so that a ball may be drawn nowhere.
+    A model that has read true frames alone does not know how to go on from there, and what it says of rewards and ends
+    is arbitrary. What it has to predict stays true, so it learns to rely on the frames before.
+    """
+    order_key, which_key = jax.random.split(key)
+    other_BFL = jax.random.permutation(order_key, frame_BFL, axis=0)
+    wrong_BFL = jax.random.bernoulli(which_key, share, frame_BFL.shape[:3])
+    return jnp.where(wrong_BFL.reshape(*wrong_BFL.shape, *(1,) * (frame_BFL.ndim - 3)), other_BFL, frame_BFL)
 
 
 def turn_losses(logits_BT: TurnLogits, turn_BT: Turn, weight_BT: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:

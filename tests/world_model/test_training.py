@@ -12,7 +12,15 @@ from flax import nnx
 
 from suite.world_model.heads import Head
 from suite.world_model.imagination import next_frame
-from suite.world_model.training import METRICS, WorldModelTrainState, cross_entropy, losses, make_optimizer, update
+from suite.world_model.training import (
+    METRICS,
+    WorldModelTrainState,
+    cross_entropy,
+    losses,
+    make_optimizer,
+    update,
+    with_wrong_tokens,
+)
 from suite.world_model.transformer import WorldModel
 from tests.world_model.small import GRID, SPEC, random_sequences, small_config, small_model
 
@@ -75,6 +83,30 @@ def test_mask_after_done(truncated):
         np.testing.assert_allclose(number, expected[name], rtol=1e-5, err_msg=name)
     unmasked, _ = losses(model, sequences, small_config(), SPEC)
     assert not np.allclose(unmasked, value)
+
+
+def test_wrong_tokens_are_of_the_same_place_in_another_sequence():
+    """Sequence b reads 1000 b + 10 t + l at step t and place l."""
+    place_BTL = jnp.asarray(1000 * np.arange(8)[:, None, None] + 10 * np.arange(5)[:, None] + np.arange(4))
+    noisy_BTL = np.asarray(with_wrong_tokens(place_BTL, 0.25, jax.random.key(0)))
+    np.testing.assert_array_equal(noisy_BTL % 1000, place_BTL % 1000)
+    assert 0.1 < (noisy_BTL != place_BTL).mean() < 0.3  # some sequences stay their own neighbours
+    assert (with_wrong_tokens(place_BTL, 0.0, jax.random.key(0)) == place_BTL).all()
+
+
+def test_wrong_tokens_are_read_in_training_alone_and_never_predicted():
+    model, config = small_model(std=0.2, dropout=0.0), small_config(token_noise=0.9)
+    value, _ = losses(model, SEQUENCES, small_config(), SPEC)
+    assert losses(model, SEQUENCES, config, SPEC)[0] == value
+    key = jax.random.key(5)
+    noisy, _ = losses(model, SEQUENCES, config, SPEC, key)
+    read_BTL = with_wrong_tokens(SEQUENCES.tokens_BTL[:, :-1], 0.9, jax.random.fold_in(key, 1))
+    assert (read_BTL != SEQUENCES.tokens_BTL[:, :-1]).any()
+    logits = model.observation_logits(model(read_BTL, SEQUENCES.action_BT))
+    expected, _ = cross_entropy(logits, SEQUENCES.tokens_BTL[:, 1:])
+    found = losses(model, SEQUENCES, config, SPEC, key)[1]["observation_loss"]
+    np.testing.assert_allclose(found, expected.mean(), rtol=1e-5)
+    assert noisy != value
 
 
 def test_chunked_logits_change_neither_losses_nor_gradients(monkeypatch):
