@@ -230,7 +230,7 @@ def test_what_stands_above_a_frame():
 
 def test_what_cannot_be_filmed(suite, tmp_path):
     for task, agent, words, message in (
-        ("openspiel/leduc", "mfrl", (), "shows symbols and no frames to film"),
+        ("openspiel/leduc", "m5", ("--dream",), "shows symbols, and --dream compares frames"),
         (TASK, "mfrl", ("--dream",), "has no world model to dream with: mfrl"),
         (TASK, "m5", ("--steps", "1"), "argument --steps: '1' is no whole number from 2 to 2,147,483,647"),
     ):

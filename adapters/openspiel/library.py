@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from suite.runtime.errors import UserError, did_you_mean
@@ -55,6 +55,25 @@ def load(name: str) -> Any:
     if obstacle:
         raise not_played(name, obstacle)
     return game
+
+
+def told(name: str, events: Sequence[int]) -> tuple[list[str], list[str]]:
+    """A game in the library's own text.
+
+    Args:
+      name: as for `load`.
+      events: T of them from the game's beginning on, of players and chance.
+
+    Returns:
+      the T + 1 states that it passes, and the T events.
+    """
+    state = load(name).new_initial_state()
+    states, moves = [str(state)], []
+    for event in events:
+        moves.append(state.action_to_string(state.current_player(), int(event)))
+        state.apply_action(int(event))
+        states.append(str(state))
+    return states, moves
 
 
 def _obstacle(kind: Any) -> str:

@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
 
 from suite.interface.tokens import Tokenizer, TokenizerState
 from suite.records.tables import write_whole
 
 CODES, CODE_COLUMNS, CODE_SIDE, CAPTION = 128, 16, 56, 16  # codes in a picture; pixels
+TEXT, MARGIN = 22, 10  # pixels
 INK, PAPER, ALARM = (20, 20, 20), (255, 255, 255), (255, 0, 160)
 
 
@@ -31,6 +33,20 @@ def save(path: Path, image: Image.Image) -> None:
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """Pillow's own."""
     return ImageFont.load_default(size)
+
+
+def pages(texts: Sequence[str], least: int) -> np.ndarray:
+    """Texts of equally wide letters as pictures, uint8 [N, H, W, 3], all as large as the largest, at least `least`."""
+    letters = ImageFont.truetype(findfont("DejaVu Sans Mono"), TEXT)
+    probe = ImageDraw.Draw(Image.new("RGB", (1, 1)))
+    corners = [probe.multiline_textbbox((MARGIN, MARGIN), text, letters)[2:] for text in texts]
+    width, height = (max(least, *(round(corner[i]) + MARGIN for corner in corners)) for i in range(2))
+    found = []
+    for text in texts:
+        page = Image.new("RGB", (width, height), PAPER)
+        ImageDraw.Draw(page).multiline_text((MARGIN, MARGIN), text, INK, letters)
+        found.append(np.asarray(page))
+    return np.stack(found)
 
 
 def enlarged(image: np.ndarray, scale: int) -> np.ndarray:

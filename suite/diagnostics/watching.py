@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -11,11 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+from suite import registry
 from suite.agent.algorithm import evaluation_key
 from suite.agent.phases import Agent
-from suite.diagnostics.filmstrips import Strip, film
+from suite.diagnostics.filmstrips import FRAME_SIDE, Strip, film
+from suite.diagnostics.pictures import pages
 from suite.interface.environment import EnvironmentSpec
 from suite.interface.tokens import TokenizerState
+from suite.interface.turns import CHANCE
 from suite.policy.ppo import PolicyTrainState
 from suite.records.record import RunRecord, require_writable
 from suite.runs.saved_model import restore
@@ -26,6 +30,9 @@ from suite.world_model.imagination import Past
 
 CHUNK = 32  # frames from which the next ones are imagined at once
 SECONDS = 0.2  # of each frame
+READING = 1.5  # seconds of each page of text
+ACROSS = 16  # symbols in a line
+MOVERS = ("chance", "agent", "opponent")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +46,7 @@ class Episode:
       value: float32 [T]; what the policy expected from there on.
       achievements: bool [T, N]; unlocked by the step or before; N = 0 for a task without.
       ended: whether its last step is the episode's, and not merely the last that was asked for.
+      mover: whose event it was, int [T] into `MOVERS`; None for single-agent tasks.
     """
 
     frames: np.ndarray
@@ -47,6 +55,7 @@ class Episode:
     value: np.ndarray
     achievements: np.ndarray
     ended: bool
+    mover: np.ndarray | None = None
 
 
 def watch(
@@ -55,7 +64,7 @@ def watch(
     """Films whole episodes of a run's newest checkpoint.
 
     Args:
-      folder: of a run of a single-agent task with frames.
+      folder: of a run. What has no frames is shown as the game's own text, or its symbols' values.
       out: of the GIF; None: `watch.gif` in the folder.
       episodes: so many, one after the other.
       steps: of each at most.
@@ -64,12 +73,13 @@ def watch(
       reporter: where progress goes.
 
     Raises:
-      UserError: the run has no checkpoint, or no frames, or no world model and `dream` is asked for.
+      UserError: the run has no checkpoint, or `dream` is asked for and it has no world model or no frames.
     """
     with RunRecord.open(folder, lock=False) as record:
         spec, name = record.spec, f"{record.config.task} {record.config.agent} seed {record.config.seed}"
-        if spec.observation.kind == "symbols":
-            raise UserError(f"{folder} is a run of {spec.id}, which shows symbols and no frames to film")
+        text = spec.observation.kind == "symbols"
+        if dream and text:
+            raise UserError(f"{spec.id} shows symbols, and --dream compares frames; see suite inspect, or leave it out")
         if dream and not record.config.world_model.enabled:
             raise UserError(f"{folder} has no world model to dream with: {record.config.agent}")
         path = out or folder / "watch.gif"
@@ -77,6 +87,11 @@ def watch(
         run = restore(record, reporter)
     key = jax.random.fold_in(evaluation_key(seed, run.step), 2)
     played = play(run.agent, run.model.policy_state, key, episodes, steps)
+    if text:
+        notes, texts = told(played, spec)
+        frames = pages(texts, FRAME_SIDE)
+        film(path, Strip(name, frames, {}, notes, frames.shape[1:3], 255), READING)
+        return path, played
     frames = np.concatenate([episode.frames for episode in played])
     imagined = {}
     if dream:
@@ -114,6 +129,8 @@ def play(agent: Agent, policy_state: PolicyTrainState, key: jax.Array, episodes:
                 "ended": log.ended_TB[:, :episodes],
             }
         )
+        if (turn := trajectory.turn_TB) is not None:
+            parts[-1]["mover"] = np.where(turn.ours, 1, np.where(turn.player == CHANCE, 0, 2))[:, :episodes]
         taken += len(log.ended_TB)
         going &= ~log.ended_TB[:, :episodes].any(axis=0)
     whole = {name: np.concatenate([part[name] for part in parts])[:steps] for name in parts[0]}
@@ -178,13 +195,41 @@ def _expected(
     return observation_BO
 
 
-def captions(episode: Episode, spec: EnvironmentSpec, number: int) -> list[str]:
-    """What stands above each frame: step, action, what it earned, the return by then, and the policy's value."""
+def told(episodes: Sequence[Episode], spec: EnvironmentSpec) -> tuple[list[str], list[str]]:
+    """Captions and texts: a page for each step and, where the game tells it, one for how an episode ends."""
+    notes, texts = [], []
+    tell = registry.task(spec.id).text
+    for number, episode in enumerate(episodes, 1):
+        if tell is None:
+            notes += captions(episode, spec, number)
+            texts += [
+                "\n".join(map(_values, np.split(frame, range(ACROSS, len(frame), ACROSS)))) for frame in episode.frames
+            ]
+            continue
+        states, moves = tell()(episode.action)
+        notes += captions(episode, spec, number, moves)
+        texts += states if episode.ended else states[:-1]
+        if episode.ended:
+            notes.append(f"episode {number}: over\nreturn {episode.reward.sum():.1f}")
+    return notes, texts
+
+
+def _values(symbols: np.ndarray) -> str:
+    return " ".join(f"{symbol:3d}" for symbol in symbols)
+
+
+def captions(episode: Episode, spec: EnvironmentSpec, number: int, moves: Sequence[str] = ()) -> list[str]:
+    """What stands above each frame: step, action, what it earned, the return by then, and the policy's value.
+
+    `moves`: what the game calls the episode's events.
+    """
     lines, total = [], 0.0
     unlocked = np.diff(episode.achievements.astype(int), axis=0, prepend=0) > 0
     for t, action in enumerate(episode.action):
         total += float(episode.reward[t])
         name = spec.action_names[action] if spec.action_names else f"action {action}"
+        if episode.mover is not None:
+            name = f"{MOVERS[episode.mover[t]]}: {moves[t] if moves else name}"
         earned = f" {episode.reward[t]:+.1f}" if abs(episode.reward[t]) > 0.05 else ""
         won = "".join(f" {spec.achievements[i]}!" for i in np.flatnonzero(unlocked[t]))
         lines.append(

@@ -41,6 +41,7 @@ def _game(name: str, summary: str = "", cost: str = "", small: str = "openspiel_
         make=Lazy("adapters.openspiel.task:make", (name,)),
         scores=Lazy("leaderboards.scoring:games"),
         presets=_presets("openspiel", paper="openspiel_paper", small=small, smoke="openspiel_smoke"),
+        text=Lazy("adapters.openspiel.library:told", (name,)),
         cost=cost,
     )
 

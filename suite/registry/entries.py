@@ -70,6 +70,8 @@ class TaskEntry:
       symbols: a function from an environment's state to what its frame shows, int32 [R], for `suite inspect`; None:
         what it shows is not known.
       symbol_values: how many values a symbol has.
+      text: a function from an episode's events to the game's own text of the state before each of them and after the
+        last, and of each event, for `suite watch` of tasks without frames; None: their symbols' values are shown.
       cost: what a run takes, in words.
       paper_agent: the agent that runs under `paper` unless another is named: what the paper's table of the task is of.
       title: as pages write it.
@@ -85,6 +87,7 @@ class TaskEntry:
     own_auto_reset: Lazy | None = None
     symbols: Lazy | None = None
     symbol_values: int = 0
+    text: Lazy | None = None
     cost: str = ""
     paper_agent: str = DEFAULT_AGENT
     title: str = ""

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from flax import nnx
 
+from suite import registry
+from suite.diagnostics.watching import MOVERS, play, told
 from suite.interface.turns import Turn
 from suite.world_model.heads import TurnLogits
 from suite.world_model.imagination import next_turn
 from suite.world_model.training import turn_losses
+from tests.tiny import PENNIES
 from tests.world_model.pennies import learned, played
 
 
@@ -140,3 +143,16 @@ def test_losses_of_turns_against_numpy():
     assert total == pytest.approx(next_player + next_legal + next_chance, rel=1e-4)
     entropy = mean(-(odds * np.log(np.where(odds > 0, odds, 1))).sum(-1), weight * (player == 0))
     assert metrics["chance_excess"] == pytest.approx(next_chance - entropy, rel=1e-3)
+
+
+def test_the_film_of_a_game(monkeypatch):
+    """`suite watch`: chance, then both players, whichever is ours; where a game has no text, its symbols' values."""
+    monkeypatch.setattr(registry, "TASKS", (PENNIES,))
+    agent, state, *_ = played()
+    episodes = play(agent, state.policy, jax.random.key(3), 2, 9)
+    movers = [[MOVERS[mover] for mover in episode.mover] for episode in episodes]
+    assert movers == [["chance", "agent", "opponent"], ["chance", "opponent", "agent"]]
+    notes, texts = told(episodes, agent.spec)
+    assert len(notes) == len(texts) == 6
+    assert notes[0].startswith(f"episode 1, step 1: chance: action {episodes[0].action[0]}\nreturn ")
+    assert [list(map(int, text.split())) for text in texts[:3]] == episodes[0].frames.tolist()

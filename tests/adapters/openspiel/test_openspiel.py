@@ -18,6 +18,7 @@ import pytest
 from adapters.openspiel import tables as game_tables
 from adapters.openspiel import task as openspiel
 from adapters.openspiel.library import GAMES
+from suite import registry
 from suite.runtime.errors import UserError
 from tests import games
 from tests.contract import check_environment
@@ -314,6 +315,14 @@ def test_parameters_are_the_librarys(tmp_path, monkeypatch):
     wide, square = openspiel.make("mnk(m=3,n=2,k=2)"), openspiel.make("mnk(m=2,n=2,k=2)")  # each has a file of its own
     assert (wide.spec.num_actions, square.spec.num_actions) == (6, 4)
     assert openspiel.spec("leduc(suit_isomorphism=true)").observation.shape < openspiel.spec("leduc").observation.shape
+
+
+def test_a_game_is_told_in_the_librarys_text():
+    states, moves = registry.task("openspiel/tic_tac_toe").text()([2, 4, 0, 5, 1])
+    assert (states[0], states[-1]) == ("...\n...\n...", "xxx\n.oo\n...")
+    assert moves == ["x(0,2)", "o(1,1)", "x(0,0)", "o(1,2)", "x(0,1)"] and len(states) == 6
+    _, dealt = registry.task("openspiel/leduc").text()([0, 1])
+    assert dealt == ["Chance outcome:0", "Chance outcome:1"]
 
 
 def test_making_reports_progress(tmp_path, monkeypatch):
