@@ -25,14 +25,19 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Protocol
 
-from pydantic import ValidationError
-
 from suite import registry
-from suite.configuration.overrides import dotted, first_problem
-from suite.configuration.schema import Config, hash_of
-from suite.records.fields import SCHEMA, ProtocolFields, RecordFields, read_json, write_json
+from suite.configuration.schema import Config
+from suite.records.fields import SCHEMA, ProtocolFields, RecordFields, write_json
 from suite.records.lock import LOCK, acquire, closed_on_error
 from suite.records.provenance import package_version, peak_memory, provenance
+from suite.records.stored_config import (
+    NEXT_CONFIG,
+    read_config,
+    require_rest,
+    require_same_rules,
+    require_same_run,
+    settle_config,
+)
 from suite.records.tables import CsvTable, read_table
 from suite.runtime.errors import RunError, UserError
 
@@ -40,8 +45,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from suite.interface.environment import EnvironmentSpec
-
-NEXT_CONFIG = "config.next.json"  # of a run that is being given more steps, until its record says that it has them
 
 
 class Curves(Protocol):
@@ -180,13 +183,13 @@ class RunRecord:
         with closed_on_error(held):
             fields = RecordFields.read(folder)
             if held is not None:
-                _settle_config(folder, fields)
-            stored = _read_config(folder, fields)
+                settle_config(folder, fields)
+            stored = read_config(folder, fields)
             if config is not None:
-                _require_same_run(folder, stored, config)
-                _require_rest(folder, fields, config)
+                require_same_run(folder, stored, config)
+                require_rest(folder, fields, config)
             if config is not None and spec is not None:
-                _require_same_rules(folder, fields.protocol, protocol(config, spec))
+                require_same_rules(folder, fields.protocol, protocol(config, spec))
             return cls(folder, config or stored, fields, spec, held)
 
     @classmethod
@@ -313,7 +316,7 @@ class RunRecord:
         self._tables["evaluations"].set_aside(lambda step: step not in evaluated, aside)
         # From here on it has that budget. If it is killed before, whoever asks for as much again comes here again.
         self.update(config_digest=digest, protocol=rules, protocol_hash=rules.hash, status="running", ended=None)
-        _settle_config(self.folder, self.fields)
+        settle_config(self.folder, self.fields)
 
     def rewind_evaluations(self, step: int) -> None:
         """Moves the evaluation episodes of the checkpoint at `step`, the newest, to `replaced/`: not all are there."""
@@ -397,75 +400,6 @@ class RunRecord:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-
-def _require_same_run(folder: Path, stored: Config, asked: Config) -> None:
-    old, new = dotted(stored), dotted(asked)
-    for name in new:
-        if old[name] == new[name] or name.startswith(("checkpoint.", "evaluation.")):
-            continue
-        why = ""
-        if name == "protocol.steps" and asked.protocol.steps > stored.protocol.steps:
-            if not asked.tied_to_budget:
-                continue
-            why = f", and what it learned depends on the budget, by {' and '.join(asked.tied_to_budget)}"
-        raise UserError(f"{folder} holds a run with {name}={old[name]}, not {new[name]}{why}; choose another --out")
-
-
-def _require_rest(folder: Path, fields: RecordFields, asked: Config) -> None:
-    """A finished run can take more steps only with the half of its last checkpoint that going on needs."""
-    had = fields.protocol.steps
-    if fields.status != "finished" or asked.protocol.steps <= had:
-        return
-    if not any((folder / "checkpoints").glob("step_*/resume")):
-        raise UserError(
-            f"{folder} holds a run that is finished after protocol.steps={had} and did not keep what more steps need "
-            "(checkpoint.keep_resume=false, or an earlier version); choose another --out"
-        )
-
-
-def _require_same_rules(folder: Path, old: ProtocolFields, new: ProtocolFields) -> None:
-    for name, value in new:
-        before = getattr(old, name)
-        if before != value and not (name == "steps" and value > before):  # more may be asked for
-            raise UserError(
-                f"{folder} was started under {name}={before}, not the present {value}; choose another --out"
-            )
-
-
-def _read_config(folder: Path, record: RecordFields) -> Config:
-    """The configuration that was run: what `record` has the digest of."""
-    stored = read_json(folder, _config_file(folder, record))
-    try:
-        config = Config(**stored)
-    except ValidationError as error:
-        raise UserError(f"{folder}/config.json is not of this version: {first_problem(error)}") from error
-    for name in ("task", "agent", "preset", "seed"):
-        if getattr(record, name) != getattr(config, name):
-            raise UserError(
-                f"{folder}/record.json says {name}={getattr(record, name)}, config.json {getattr(config, name)}"
-            )
-    if record.config_digest != _digest_of(stored):
-        raise UserError(f"{folder}/config.json is not the configuration that was run ({record.config_digest})")
-    return config
-
-
-def _digest_of(stored: Mapping[str, Any]) -> str:
-    """`Config.digest` of a file as it was written: later versions may have fields more."""
-    return hash_of({name: value for name, value in stored.items() if name not in ("checkpoint", "evaluation")})
-
-
-def _config_file(folder: Path, record: RecordFields) -> str:
-    """The name of the file that holds the configuration."""
-    if not (folder / NEXT_CONFIG).exists() or _digest_of(read_json(folder, NEXT_CONFIG)) != record.config_digest:
-        return "config.json"
-    return NEXT_CONFIG
-
-
-def _settle_config(folder: Path, record: RecordFields) -> None:
-    """Gives the file its usual name."""
-    if (name := _config_file(folder, record)) == NEXT_CONFIG:
-        os.replace(folder / name, folder / "config.json")
 
 
 def _now() -> str:

@@ -338,7 +338,7 @@ def test_a_run_killed_while_it_was_given_more_steps_has_the_old_ones_or_the_new(
             patch.setattr(CsvTable, "set_aside", killed)
         else:
             calls = []
-            patch.setattr(record_module, "_settle_config", lambda *args: killed() if calls else calls.append(args))
+            patch.setattr(record_module, "settle_config", lambda *args: killed() if calls else calls.append(args))
         training.run(config("random"), tmp_path, QuietReporter())
     record = RunRecord.open(folder, lock=False)
     assert (record.finished, record.config.protocol.steps) == ((True, 96) if before else (False, 192))
