@@ -95,6 +95,7 @@ MODEL_NOTES = {
     "world_model.patch_contents": False,
     "world_model.paid": 0,
     "world_model.event_share": 0.0,
+    "world_model.token_noise": 0.0,
     "world_model.optimizer": "adam",  # 23
     "world_model.average": 0.0,
     "imagination.min_p": 0.0,
