@@ -256,7 +256,7 @@ class Agent(Dreaming):
     ) -> tuple[ppo.PolicyTrainState, Metrics]:
         """Step 4: `updates` times (a traced number, so that annealing never recompiles), dream and learn from it.
 
-        After `steps` real steps (float32 scalar), of which the learning rate depends if it is annealed.
+        After `steps` real steps (float32 scalar), on which the learning rate depends if it is annealed.
         An agent that dreams in the true game has neither `world_model` nor `tokenizer`.
         """
         model = None if world_model is None else nnx.merge(self.world_model_graph, world_model)
