@@ -7,8 +7,11 @@ was copied from another seed, agent or game, or whose configuration was changed,
 
 from __future__ import annotations
 
+import concurrent.futures
 import math
+import multiprocessing
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +23,7 @@ from suite.configuration.schema import Config
 from suite.records.record import RunRecord
 from suite.runs.saved_model import agent_for
 from suite.runs.training import PART_OF, IterationLog
-from suite.runtime.reporting import Reporter
+from suite.runtime.reporting import QuietReporter, Reporter
 
 PLAYED = ("reward_per_step", "episodes", "return")  # of metrics.csv: what play gave
 DREAMT = "imagine/"  # dreams are not replayed
@@ -29,34 +32,64 @@ EXACT = 1e-5  # sums of float32 in another order
 LEARNED, NOTHING = 0.05, 1e-3
 
 
-def replay(standings: Sequence[Standing], runs: int | None, reporter: Reporter) -> Iterator[tuple[str, list[str]]]:
+def replay(
+    standings: Sequence[Standing], runs: int | None, reporter: Reporter, jobs: int = 1
+) -> Iterator[tuple[str, list[str]]]:
     """Runs the first iteration of published runs again.
 
     Args:
       standings: what is published.
       runs: how many of them, drawn anew each time; None: all.
       reporter: where progress goes.
+      jobs: processes that do so side by side.
 
     Yields:
-      where a run's evidence lies, and every difference, a line each.
+      where a run's evidence lies, and every difference, a line each; in any order, if there are several processes.
     """
-    chosen = [
-        (path.as_posix(), record)
+    rows = [
+        [(path.as_posix(), record.folder) for path, record in zip(standing.paths, standing.entry.records, strict=True)]
         for standing in standings
-        for path, record in zip(standing.paths, standing.entry.records, strict=True)
     ]
-    if runs is not None and runs < len(chosen):
-        drawn = np.random.default_rng().choice(len(chosen), runs, replace=False)
-        chosen = [chosen[index] for index in sorted(drawn)]
-    for done, (path, record) in enumerate(chosen):
-        reporter.texture(f"Replaying {path}", done / len(chosen))
-        yield path, differences(record, first_iteration(record.config, reporter))
-    reporter.texture("Replayed", 1.0)
+    number = sum(map(len, rows))
+    if runs is not None and runs < number:
+        drawn = iter(np.isin(np.arange(number), np.random.default_rng().choice(number, runs, replace=False)))
+        rows = [[run for run in row if next(drawn)] for row in rows]
+        number = runs
+    for done, (path, found) in enumerate(_replayed(list(filter(None, rows)), jobs)):
+        reporter.texture(f"Replayed {path}", (done + 1) / number)
+        yield path, found
 
 
-def first_iteration(config: Config, reporter: Reporter) -> IterationLog:
+Runs = list[tuple[str, Path]]  # where the evidence lies relative to the leaderboards, and its folder
+
+
+def _replayed(rows: list[Runs], jobs: int) -> Iterator[tuple[str, list[str]]]:
+    """Paths and differences, as they are found. The runs of a row are of one agent, which is built and compiled once."""
+    if jobs == 1:
+        for row in rows:
+            yield from _row(row)
+        return
+    with concurrent.futures.ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        try:
+            for future in concurrent.futures.as_completed([pool.submit(_listed, row) for row in rows]):
+                yield from future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _listed(row: Runs) -> list[tuple[str, list[str]]]:
+    return list(_row(row))
+
+
+def _row(row: Runs) -> Iterator[tuple[str, list[str]]]:
+    for path, folder in row:
+        record = RunRecord.open(folder, lock=False)
+        yield path, differences(record, first_iteration(record.config))
+
+
+def first_iteration(config: Config) -> IterationLog:
     """What a run's first iteration gives, but for dreams."""
-    agent = agent_for(config, reporter)
+    agent = agent_for(config, QuietReporter())
     log = IterationLog(agent.spec, 0)
 
     def call(phase: str, function: Any, *arguments: Any) -> Any:

@@ -295,12 +295,12 @@ class Process:
         return Outcome("failed", f"died of {signal.Signals(-code).name}" if died else reason.removeprefix("error: "))
 
 
-def default_jobs() -> int:
-    """How many runs this machine takes at once: one on an accelerator, or one for every two CPU cores."""
+def default_jobs(cores_each: int = CPUS_PER_RUN) -> int:
+    """How many runs this machine takes at once: one on an accelerator, or one for every two CPU cores or so many."""
     if device_kind() != "cpu":
         return 1
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // CPUS_PER_RUN)
+    return max(1, cores // cores_each)
 
 
 def share_of_memory(share: float) -> dict[str, str]:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from leaderboards.replay import differences, first_iteration
+from leaderboards.boards import Standing
+from leaderboards.replay import differences, first_iteration, replay
+from leaderboards.results import Entry
 from suite import registry
 from suite.configuration.schema import Config
 from suite.records.record import RunRecord
@@ -26,8 +29,8 @@ def registered():
         yield
 
 
-def train(out, agent="m5", seed=0):
-    config = registry.resolve(WIDE_CORRIDOR.id, agent, "smoke", ["evaluation.every_steps=0"], seed)
+def train(out, agent="m5", seed=0, task=WIDE_CORRIDOR.id):
+    config = registry.resolve(task, agent, "smoke", ["evaluation.every_steps=0"], seed)
     return training.run(config, out, QUIET, callbacks=[lambda iteration: True]).folder
 
 
@@ -40,7 +43,7 @@ def runs(tmp_path_factory):
 
 def replayed(folder):
     record = RunRecord.open(folder, lock=False)
-    return differences(record, first_iteration(record.config, QUIET))
+    return differences(record, first_iteration(record.config))
 
 
 def test_a_run_begins_as_its_record_says(runs):
@@ -102,3 +105,20 @@ def test_forgeries_are_found(runs, forge, found, tmp_path):
     folder = shutil.copytree(runs["run"], tmp_path / "run")
     forge(folder, runs)
     assert any(found in problem for problem in replayed(folder))
+
+
+def test_processes_side_by_side_replay_each_run_once(tmp_path):
+    folders = [train(tmp_path, "random", seed, "openspiel/tic_tac_toe") for seed in (0, 1, 2)]
+    shutil.copy(folders[0] / "episodes.csv", folders[1] / "episodes.csv")
+    rows = [standing(*folders[:2]), standing(folders[2])]
+    found = dict(replay(rows, None, QUIET, jobs=2))
+    assert found.keys() == {folder.name for folder in folders}
+    assert found["seed_0"] == found["seed_2"] == []
+    assert "episodes" in found["seed_1"][0]
+    assert len(list(replay(rows, 1, QUIET, jobs=1))) == 1
+
+
+def standing(*folders):
+    """A published row of these runs, whose evidence is said to lie in folders named after them."""
+    records = tuple(RunRecord.open(folder, lock=False) for folder in folders)
+    return Standing(Entry(records), tuple(Path(folder.name) for folder in folders))
