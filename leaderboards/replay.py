@@ -64,7 +64,7 @@ Runs = list[tuple[str, Path]]  # where the evidence lies relative to the leaderb
 
 
 def _replayed(rows: list[Runs], jobs: int) -> Iterator[tuple[str, list[str]]]:
-    """Paths and differences, as they are found. The runs of a row are of one agent, which is built and compiled once."""
+    """Paths and differences, as they are found. The runs of a row share an agent, which is built and compiled once."""
     if jobs == 1:
         for row in rows:
             yield from _row(row)
