@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw
+from PIL.PngImagePlugin import PngInfo
 
 from suite.configuration.schema import PATCH_THRESHOLD
 from suite.diagnostics.evaluation_set import EvaluationSet
@@ -20,6 +21,8 @@ FRAME_SIDE = 190  # pixels, about
 PER_ROW = 7  # frames side by side; longer strips go on below
 HEADER, LABEL, GAP = 22, 22, 6  # pixels
 SECONDS = 0.7  # of each frame of a film
+SMALL_BYTES, SMALL_FRAMES, SMALL_SIDE, SMALL_GAP = 30_000, 6, 63, 2  # of a filmstrip for a page: at most, and pixels
+SMALL_COLORS = (256, 64, 16)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +91,35 @@ def filmstrip(strip: Strip) -> Image.Image:
                 picture.paste(Image.fromarray(images[t]), (x, y + LABEL))
             y += LABEL + height
     return picture
+
+
+def small_filmstrip(strip: Strip) -> bytes:
+    """A PNG for a page: a row of frames as they are, a row for each run below; "Description" in it says which.
+
+    Of a longer trajectory it has some frames, from the first to the last. If that is more than `SMALL_BYTES`, it has
+    fewer colours, and then fewer frames.
+    """
+    rows = [strip.real, *(np.concatenate([strip.real[:1], frames]) for frames in strip.imagined.values())]
+    scale = max(1, SMALL_SIDE // max(strip.real.shape[1:3]))
+    height, width = (scale * side + SMALL_GAP for side in strip.real.shape[1:3])
+    for count in range(min(SMALL_FRAMES, len(strip.real)), 1, -1):
+        shown = np.linspace(0, len(strip.real) - 1, count).round().astype(int).tolist()
+        picture = Image.new("RGB", (count * width - SMALL_GAP, len(rows) * height - SMALL_GAP), PAPER)
+        for y, frames in enumerate(rows):
+            for x, t in enumerate(shown):
+                if t < len(frames):
+                    frame = Image.fromarray(enlarged(as_rgb(frames[t], strip.high), scale))
+                    picture.paste(frame, (x * width, y * height))
+        text = PngInfo()
+        steps, names = ", ".join(map(str, shown)), ", ".join(["real", *strip.imagined])
+        text.add_text("Description", f"{strip.title} From left to right steps {steps}; from above {names}.")
+        for colors in SMALL_COLORS:
+            content = io.BytesIO()
+            few = picture.quantize(colors, dither=Image.Dither.NONE)
+            few.save(content, "PNG", optimize=True, pnginfo=text)
+            if len(content.getvalue()) <= SMALL_BYTES:
+                return content.getvalue()
+    return content.getvalue()
 
 
 def film(path: Path, strip: Strip, seconds: float = SECONDS) -> None:

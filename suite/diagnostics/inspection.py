@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -27,7 +28,8 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
     """Compares the world models of runs on the evaluation set of Section 4.4, and writes what it finds.
 
     Files: `summary.csv` (a row per run), `steps.csv` (a row per run and step, see `rollouts.compare`), `codes.csv`
-    (codebook over time), `curves.png`, per run `codes-<run>.png`, and filmstrips `rollout-<n>.png` and `.gif`.
+    (codebook over time), `curves.png`, per run `codes-<run>.png`, filmstrips `rollout-<n>.png` and `.gif`, and a small
+    one for a page, `filmstrip.png`, with the first run of each agent.
 
     Args:
       folders: of runs of one single-agent task and preset.
@@ -82,7 +84,7 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
         _write_table(out / "codes.csv", codes)
     pictures.curves(out / "curves.png", steps, codes)
     if grid:
-        _write_strips(out, real, rollouts_of, records[0])
+        _write_strips(out, real, rollouts_of, records)
     return {"folder": str(out), "runs": rows}
 
 
@@ -130,10 +132,13 @@ def _write_table(path: Path, tables: dict[str, pd.DataFrame]) -> None:
     write_whole(path, whole.to_csv(index=False, lineterminator="\n").encode())
 
 
-def _write_strips(out: Path, real: EvaluationSet, rollouts_of: dict[str, Rollouts], record: RunRecord) -> None:
-    observation = record.spec.observation
+def _write_strips(
+    out: Path, real: EvaluationSet, rollouts_of: dict[str, Rollouts], records: Sequence[RunRecord]
+) -> None:
+    task, observation = records[0].config.task, records[0].spec.observation
+    first = {record.config.agent: name for name, record in zip(reversed(rollouts_of), reversed(records), strict=True)}
     longest = max(rollouts.steps for rollouts in rollouts_of.values())
-    for number in filmstrips.choose(real, longest, STRIPS):
+    for i, number in enumerate(filmstrips.choose(real, longest, STRIPS)):
         steps = int(real.frame_counted[number, :longest].sum())
         notes = ["step 0: start"]
         for t in range(steps):
@@ -141,7 +146,7 @@ def _write_strips(out: Path, real: EvaluationSet, rollouts_of: dict[str, Rollout
             earned = f", reward {reward:+.3g}" if abs(reward) > 1e-6 else ""
             notes.append(f"step {t + 1}: action {real.action[number, t]}{earned}")
         strip = filmstrips.Strip(
-            title=f"{record.config.task}, trajectory {number}. Outlined: patches that differ from the real frame.",
+            title=f"{task}, trajectory {number}. Outlined: patches that differ from the real frame.",
             real=real.frames[number, : steps + 1],
             imagined={name: rollouts.frames[number, :steps] for name, rollouts in rollouts_of.items()},
             notes=notes,
@@ -150,3 +155,7 @@ def _write_strips(out: Path, real: EvaluationSet, rollouts_of: dict[str, Rollout
         )
         pictures.save(out / f"rollout-{number:03}.png", filmstrips.filmstrip(strip))
         filmstrips.film(out / f"rollout-{number:03}.gif", strip)
+        if i == 0:
+            few = {name: frames for name, frames in strip.imagined.items() if name in first.values()}
+            small = dataclasses.replace(strip, title=f"{task}, trajectory {number}.", imagined=few)
+            write_whole(out / "filmstrip.png", filmstrips.small_filmstrip(small))

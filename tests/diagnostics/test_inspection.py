@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from PIL import Image
 
 from suite import registry
 from suite.agent.phases import Agent
-from suite.diagnostics import evaluation_set, inspection, rollouts, symbols
+from suite.diagnostics import evaluation_set, filmstrips, inspection, rollouts, symbols
 from suite.diagnostics.evaluation_set import Pairs, WithSymbols
 from suite.records import checkpoint
 from suite.records.record import RunRecord, run_folder
@@ -169,7 +170,11 @@ def test_two_runs_side_by_side(runs, tmp_path):
     assert found["runs"]["m5"]["codes_used"] == 2 and "codes_used" not in found["runs"]["m5_continuous"]
     assert set(pd.read_csv(out / "codes.csv").run) == {"m5"}
     pictures = sorted(path.name for path in out.glob("*.png"))
-    assert pictures[:2] == ["codes-m5.png", "curves.png"] and len(pictures) > 2
+    assert pictures[:3] == ["codes-m5.png", "curves.png", "filmstrip.png"] and len(pictures) > 3
+    with Image.open(out / "filmstrip.png") as strip:
+        said = strip.info["Description"]
+        assert strip.size == (6 * 60 + 5 * 2, 3 * 60 + 2 * 2)  # frames of 4x4, fifteen times as large, one row a run
+    assert said.startswith("corridor, trajectory ") and said.endswith("from above real, m5, m5_continuous.")
     for path in out.iterdir():
         if path.suffix == ".gif":
             with Image.open(path) as film:
@@ -177,6 +182,33 @@ def test_two_runs_side_by_side(runs, tmp_path):
         elif path.suffix == ".png":
             with Image.open(path) as image:
                 assert len(image.convert("RGB").getcolors(2**24)) > 2  # not blank
+
+
+def strip_of(frames, runs=("m5",)):
+    return filmstrips.Strip("Trajectory 3.", frames, dict.fromkeys(runs, frames[1:]), [], (7, 7), 255)
+
+
+def test_a_small_filmstrip_is_of_the_frames():
+    """Every second one of ten steps; those of a run that ended early are missing."""
+    colors = np.random.default_rng(0).integers(0, 256, (11, 9, 9, 3), np.uint8)
+    colors[:, :, :, 1:] //= 128  # few enough for a palette
+    frames = (colors // 64 * 64).repeat(7, 1).repeat(7, 2)
+    strip = dataclasses.replace(strip_of(frames), imagined={"m5": frames[:5]})
+    with Image.open(io.BytesIO(filmstrips.small_filmstrip(strip))) as image:
+        shown = np.asarray(image.convert("RGB"))
+        assert image.info["Description"].endswith("steps 0, 2, 4, 6, 8, 10; from above real, m5.")
+    assert shown.shape == (2 * 63 + 2, 6 * 63 + 5 * 2, 3)
+    for i, t in enumerate((0, 2, 4, 6, 8, 10)):
+        real, imagined = (shown[top : top + 63, 65 * i : 65 * i + 63] for top in (0, 65))
+        assert (real == frames[t]).all()
+        assert (imagined == (frames[max(t - 1, 0)] if t <= 5 else 255)).all()
+
+
+def test_a_small_filmstrip_stays_small():
+    """The worst that a page can be given: noise, of seven rows."""
+    frames = np.random.default_rng(0).integers(0, 256, (11, 63, 63, 3), np.uint8)
+    content = filmstrips.small_filmstrip(strip_of(frames, [f"m{i}" for i in range(1, 7)]))
+    assert 10_000 < len(content) <= filmstrips.SMALL_BYTES
 
 
 def test_one_run_of_a_task_without_symbols(tmp_path):
