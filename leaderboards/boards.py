@@ -17,6 +17,7 @@ from leaderboards.published import OF_FAMILY, published
 from leaderboards.qualification import evidence_files, overrides
 from leaderboards.results import Entry
 from suite import registry
+from suite.interface.environment import EnvironmentSpec
 from suite.records.fields import DeviceFields, RecordFields
 
 COLUMNS = (
@@ -132,7 +133,7 @@ def _rows(standing: Standing) -> Rows:
         "seeds": len(entry.seeds),
         "seed_list": ranges(entry.seeds),
         "steps": rules.steps,
-        "observation": sees(entry),
+        "observation": sees(entry.spec),
         "environment": rules.package,
         "environment_version": rules.package_version,
         "protocol": entry.protocol_hash,
@@ -165,7 +166,7 @@ def _family_rows(group: Sequence[FamilyScores]) -> Rows:
             "seeds": min(len(entry.seeds) for entry in scores.entries),
             "seed_list": ranges(set.intersection(*(set(entry.seeds) for entry in scores.entries))),
             "steps": rules.steps,
-            "observation": sees(first),
+            "observation": sees(first.spec),
             "environment": rules.package,
             "environment_version": rules.package_version,
             "minutes": float(sum(entry.minutes.mean() for entry in scores.entries)),
@@ -201,9 +202,9 @@ def _note(agent: str) -> str | None:
     return USES_SIMULATOR if agent in known and known[agent].uses_simulator else None
 
 
-def sees(entry: Entry) -> str:
-    """What its task shows: "pixels" or "symbolic"."""
-    return "pixels" if entry.spec.observation.kind == "pixels" else "symbolic"
+def sees(spec: EnvironmentSpec) -> str:
+    """What a task shows: "pixels" or "symbolic"."""
+    return "pixels" if spec.observation.kind == "pixels" else "symbolic"
 
 
 def _ordered(ours: pd.DataFrame, literature: pd.DataFrame) -> pd.DataFrame:

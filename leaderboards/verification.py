@@ -7,6 +7,7 @@ import io
 from pathlib import Path
 
 from leaderboards.boards import as_csv, boards
+from leaderboards.inspections import FILES, inspections_in, is_inspection
 from leaderboards.publish import PAGE, evidence_in
 from leaderboards.published import PATH
 from leaderboards.qualification import EVIDENCE
@@ -27,11 +28,16 @@ def verify(out: Path) -> list[str]:
     tables = boards(standings)
     for name, board in tables.items():
         problems += (f"{name}: {problem}" for problem in _differences(out / name, as_csv(board)))
-    if (out / PAGE).exists():
-        from leaderboards.page.page import page
+    try:
+        inspections = inspections_in(out)
+    except UserError as error:
+        problems.append(str(error))
+    else:
+        if (out / PAGE).exists():
+            from leaderboards.page.page import page
 
-        if (out / PAGE).read_bytes() != page([standing.entry for standing in standings], tables):
-            problems.append(f"{PAGE}: not what these runs give: publish again with --page {out}")
+            if (out / PAGE).read_bytes() != page([standing.entry for standing in standings], tables, inspections):
+                problems.append(f"{PAGE}: not what these runs give: publish again with --page {out}")
     literature = out / PATH.name
     if literature.exists() and literature.read_bytes() != PATH.read_bytes():
         problems.append(f"{PATH.name}: not this version's")
@@ -41,14 +47,14 @@ def verify(out: Path) -> list[str]:
 
 
 def _foreign(evidence: Path) -> list[Path]:
-    """Files that are neither evidence of a run nor, below a folder of that name, tables of `suite inspect`."""
+    """Files that are neither evidence of a run nor what `suite inspect` found of some."""
     runs = set(run_folders([evidence]))
     return [
         path
         for path in sorted(evidence.rglob("*"))
         if path.is_file()
         and not (path.parent in runs and path.name in EVIDENCE)
-        and not ("inspect" in path.parts and path.suffix == ".csv")
+        and not (is_inspection(path.parent, evidence) and path.name in FILES)
     ]
 
 

@@ -1,6 +1,6 @@
 "use strict";
 
-// A cell's number is in data-value; text sorts as text. What is empty stays last in both directions.
+// What is empty stays last in both directions.
 function compare(a, b, direction) {
   if (a === "" || b === "") return (a === "") - (b === "");
   const [x, y] = [Number(a), Number(b)];
@@ -8,7 +8,12 @@ function compare(a, b, direction) {
   return direction === "ascending" ? order : -order;
 }
 
-const valueOf = (row, index) => row.cells[index].dataset.value ?? row.cells[index].textContent.trim();
+// What a cell sorts by: its data-value, or else its text, or in a column of numbers the one that this begins with.
+function valueOf(row, header) {
+  const cell = row.cells[header.cellIndex];
+  const text = cell.dataset.value ?? cell.textContent.trim();
+  return text && header.classList.contains("number") ? String(parseFloat(text.replaceAll(",", ""))) : text;
+}
 
 for (const table of document.querySelectorAll("table")) {
   table.tHead.addEventListener("click", (event) => {
@@ -22,7 +27,7 @@ for (const table of document.querySelectorAll("table")) {
     header.setAttribute("aria-sort", direction);
     for (const body of table.tBodies) {
       const rows = [...body.querySelectorAll("tr[data-origin]")]; // what stands above a group of rows stays there
-      rows.sort((a, b) => compare(valueOf(a, header.cellIndex), valueOf(b, header.cellIndex), direction));
+      rows.sort((a, b) => compare(valueOf(a, header), valueOf(b, header), direction));
       body.append(...rows);
     }
   });
@@ -41,7 +46,7 @@ filters.addEventListener("change", (event) => {
   }
   const empty = (part, what) => ![...part.querySelectorAll(what)].some((element) => !element.hidden);
   for (const body of document.querySelectorAll("tbody")) body.hidden = empty(body, "tr[data-origin]");
-  for (const more of document.querySelectorAll("details.more")) more.hidden = empty(more, "figure");
+  for (const part of document.querySelectorAll("details.more, .models")) part.hidden = empty(part, "figure");
   for (const section of document.querySelectorAll("section")) section.hidden = empty(section, "tr[data-origin]");
   for (const link of document.querySelectorAll("nav a")) link.hidden = document.querySelector(link.hash).hidden;
   const shown = rows.filter((row) => !row.hidden).length;

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,9 +12,11 @@ import jinja2
 import markupsafe
 import pandas as pd
 
-from leaderboards.boards import IMPROVEMENT, OVERALL, sees
+from leaderboards.boards import IMPROVEMENT, OVERALL
 from leaderboards.families import families
-from leaderboards.page import plots
+from leaderboards.inspections import Inspection
+from leaderboards.page import plots, world_models
+from leaderboards.page.figures import PageFigure, facts_of, write_once
 from leaderboards.publish import PAGE
 from leaderboards.published import OF_FAMILY
 from leaderboards.qualification import overrides
@@ -48,9 +49,7 @@ class Cell:
       error: behind the text, in a line of its own where there is little room.
       note: small print.
       folded: what is shown when asked for, with the words to ask by.
-      numeric: stands right.
-      badge: the class of a badge around the text.
-      minor: left out on a phone, unless all columns are asked for.
+      badge: whether there is a frame around the text, of the row's colour.
     """
 
     text: str
@@ -58,44 +57,60 @@ class Cell:
     error: str = ""
     note: str = ""
     folded: tuple[str, str] | None = None
-    numeric: bool = False
-    badge: str = ""
-    minor: bool = False
+    badge: bool = False
+
+    @property
+    def key(self) -> str:
+        """What the page's script sorts by, where that is not what the text begins with."""
+        if isinstance(self.value, str):
+            return "" if self.value == self.text else self.value
+        key = f"{self.value:.6g}"
+        return "" if float(self.text.replace(",", "")) == float(key) else key
 
 
 @dataclasses.dataclass(frozen=True)
 class Column:
-    """Of a table; numbers stand right, and sort from the best down. A minor one is left out on a phone."""
+    """Of a table; numbers stand right, and sort from the best down. A minor one is left out on a phone.
+
+    What cells look like, page.css says by the place of their column: the last six are the same in all tables.
+    """
 
     label: str
     numeric: bool = False
     minor: bool = False
 
 
-def write_page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame], folder: Path) -> Path:
+def write_page(
+    entries: Sequence[Entry],
+    tables: Mapping[str, pd.DataFrame],
+    folder: Path,
+    inspections: Sequence[Inspection] = (),
+) -> Path:
     """Writes `folder/index.html`, which holds everything that it shows.
 
     Args:
-      entries, tables: as for `page`.
+      entries, tables, inspections: as for `page`.
       folder: is made if it is not there.
 
     Raises:
       UserError: the folder cannot be written.
     """
     require_writable(folder, "--page")
-    write_whole(folder / PAGE, page(entries, tables))
+    write_whole(folder / PAGE, page(entries, tables, inspections))
     return folder / PAGE
 
 
-def page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame]) -> bytes:
+def page(entries: Sequence[Entry], tables: Mapping[str, pd.DataFrame], inspections: Sequence[Inspection] = ()) -> bytes:
     """The page, always the same bytes for the same runs.
 
     Args:
       entries: for the figures.
       tables: what `leaderboards.boards` makes of them.
+      inspections: of world models, for the sections of their tasks.
     """
     everything = pd.concat([table for table in tables.values() if len(table)], ignore_index=True)
-    sections = [_section(name, table, entries, everything) for name, table in tables.items() if len(table)]
+    sections = [_section(name, table, entries, everything, inspections) for name, table in tables.items() if len(table)]
+    write_once(figure for section in sections for figure in (*section["lead"], *section["more"]))
     budgets = sorted({int(steps) for table in tables.values() for steps in table["steps"].dropna()})
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(HERE), autoescape=True, undefined=jinja2.StrictUndefined
@@ -126,13 +141,20 @@ def _classes_for_styles(html: str) -> str:
     return html.replace("</style>", f"{rules}</style>", 1)
 
 
-def _section(name: str, table: pd.DataFrame, entries: Sequence[Entry], everything: pd.DataFrame) -> dict[str, Any]:
+def _section(
+    name: str,
+    table: pd.DataFrame,
+    entries: Sequence[Entry],
+    everything: pd.DataFrame,
+    inspections: Sequence[Inspection],
+) -> dict[str, Any]:
     """`everything`: all tables' rows, as a family's picture shows what was published of its games."""
     id = name.removesuffix(".csv")
     overall = name == OVERALL
     task = "" if overall else str(table["task"].iloc[0])
     title = OVERALL_TITLE if overall else registry.task(task).title
     own = entries if overall else [entry for entry in entries if entry.config.task == task]
+    inspected = [] if overall else [found for found in inspections if found.task == task]
     parts = list(table.groupby("task", sort=False)) if overall else [("", table)]
     metrics = [] if overall else _shown(table["metric"])
     return {
@@ -145,10 +167,11 @@ def _section(name: str, table: pd.DataFrame, entries: Sequence[Entry], everythin
             {"title": _heading(str(family), part), "rows": list(_rows(part, metrics or _shown(part["metric"], pad=2)))}
             for family, part in parts
         ],
-        "lead": [_with_own_ids(figure, id) for figure in _stories(own, everything)],
-        "more": [
-            _with_own_ids(figure, id) for figure in (_family_figures(entries) if overall else _figures(own, table))
-        ],
+        "lead": list(_stories(own, everything)),
+        "models": list(world_models.figures(inspected)),
+        "reading": world_models.reading(inspected),
+        "inspected": " ".join(found.sha256 for found in inspected),
+        "more": list(_family_figures(entries) if overall else _figures(own, table)),
     }
 
 
@@ -199,7 +222,7 @@ def _rows(table: pd.DataFrame, metrics: Sequence[str]) -> Iterator[dict[str, Any
         )
         cells = [_number(row["rank"], "{:.0f}"), method, *(_score(scores.get(metric)) for metric in metrics)]
         origin = "measured" if ours else "published"
-        lesser = [Cell(origin, origin, badge="ours" if ours else "theirs")]
+        lesser = [Cell(origin, origin, badge=True)]
         lesser.append(Cell(_text(row["preset"]), _text(row["preset"])))
         which = f"which: {row['seed_list']}" if ours and row["seed_list"] else ""
         lesser.append(dataclasses.replace(_number(row["seeds"], "{:.0f}"), note=which))
@@ -210,7 +233,7 @@ def _rows(table: pd.DataFrame, metrics: Sequence[str]) -> Iterator[dict[str, Any
             "origin": "ours" if ours else "theirs",
             "observation": row["observation"],
             "steps": "" if pd.isna(row["steps"]) else int(row["steps"]),
-            "cells": cells + [dataclasses.replace(cell, minor=True) for cell in lesser],
+            "cells": cells + lesser,
         }
 
 
@@ -225,11 +248,11 @@ def _circumstances(row: Mapping[Any, Any]) -> str:
 def _score(row: Mapping[Any, Any] | None) -> Cell:
     """Mean and error; below them, the interval of the interquartile mean."""
     if row is None:
-        return Cell("", numeric=True)
+        return Cell("")
     known = not pd.isna(row["error"])
     error = f"\N{PLUS-MINUS SIGN}\N{NO-BREAK SPACE}{_digits(row['error'], row['value'])}" if known else ""
     interval = "" if pd.isna(row["iqm_low"]) else f"[{_digits(row['iqm_low'])}, {_digits(row['iqm_high'])}]"
-    return Cell(_digits(row["value"]), row["value"], error, interval, numeric=True)
+    return Cell(_digits(row["value"]), row["value"], error, interval)
 
 
 def _digits(value: float, like: float | None = None) -> str:
@@ -238,7 +261,7 @@ def _digits(value: float, like: float | None = None) -> str:
 
 
 def _number(value: Any, form: str) -> Cell:
-    return Cell("", numeric=True) if pd.isna(value) else Cell(form.format(value), float(value), numeric=True)
+    return Cell("") if pd.isna(value) else Cell(form.format(value), float(value))
 
 
 def _text(value: Any) -> str:
@@ -254,7 +277,7 @@ def _groups(entries: Sequence[Entry]) -> dict[tuple[str, str, str], list[Entry]]
     return groups
 
 
-def _stories(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str, Any]]:
+def _stories(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[PageFigure]:
     """The figure that comes first, one for each family and preset: do agents learn faster with dreams?"""
     games_of: dict[tuple[str, str], dict[str, list[Entry]]] = {}
     for (task, preset, _), group in _groups(entries).items():
@@ -295,7 +318,7 @@ def panel_of(entries: Sequence[Entry], table: pd.DataFrame, title: str) -> plots
     return plots.Panel(title, entries, score, _label(score).lower(), published)
 
 
-def _figures(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[dict[str, Any]]:
+def _figures(entries: Sequence[Entry], table: pd.DataFrame) -> Iterator[PageFigure]:
     """Of a task, the rest: one set for each preset and protocol that runs were made under."""
     for (_, preset, _), group in _groups(entries).items():
         panel = panel_of(group, table, "")
@@ -339,7 +362,7 @@ def _points(table: pd.DataFrame) -> list[tuple[str, str, str, float, float]]:
     ]  # fmt: skip
 
 
-def _family_figures(entries: Sequence[Entry]) -> Iterator[dict[str, Any]]:
+def _family_figures(entries: Sequence[Entry]) -> Iterator[PageFigure]:
     """Performance profiles over all runs of all games of a family."""
     for group in families(entries):
         first = group[0]
@@ -354,18 +377,6 @@ def _family_figures(entries: Sequence[Entry]) -> Iterator[dict[str, Any]]:
             )
 
 
-def _figure(svg: str, caption: str, of: Entry | None = None) -> dict[str, Any]:
-    """`of`: whose task and budget it belongs to, by which it is filtered."""
-    facts = {}
-    if of is not None:
-        facts = {"origin": "ours", "observation": sees(of), "steps": of.config.protocol.steps}
-    return {"svg": svg, "caption": caption, "facts": facts}
-
-
-def _with_own_ids(figure: dict[str, Any], section: str) -> dict[str, Any]:
-    """Ids are unique on the page: every figure has those of its own, also where two sections show the same one."""
-    svg = figure["svg"]
-    prefix = hashlib.sha256(f"{section} {svg}".encode()).hexdigest()[:8]
-    for mark in ('id="', 'href="#', "url(#"):
-        svg = svg.replace(mark, f"{mark}{prefix}-")
-    return figure | {"svg": markupsafe.Markup(svg)}
+def _figure(svg: str, caption: str, of: Entry | None = None) -> PageFigure:
+    """`of`: whose task and budget it belongs to."""
+    return PageFigure(svg, caption, {} if of is None else facts_of(of.spec, of.config.protocol.steps))

@@ -8,21 +8,22 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import io
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from leaderboards import statistics
+from leaderboards.inspections import ERROR, SYMBOLS, InspectedRun
+from leaderboards.page.svg import svg_of
 from leaderboards.results import Entry
 from suite import registry
 
@@ -89,7 +90,7 @@ def learning_curves(panels: Sequence[Panel]) -> str:
             axes.set_axis_off()
         _legend(figure)
         what = ", ".join(dict.fromkeys(panel.label for panel in panels))
-        return _svg(figure, f"Learning curves: {what} against real environment steps")
+        return svg_of(figure, f"Learning curves: {what} against real environment steps", VARIABLES)
 
 
 def _learning_curve(axes: Axes, panel: Panel) -> None:
@@ -113,6 +114,41 @@ def _learning_curve(axes: Axes, panel: Panel) -> None:
     axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k")
 
 
+def world_models(rows: Sequence[tuple[str, Sequence[InspectedRun]]]) -> str:
+    """Rollouts beside reality: symbols right, where they are known, and the error of frames; a line for each agent.
+
+    Args:
+      rows: of panels: a title, "" for none, and runs that may be compared.
+    """
+    measures = [SYMBOLS, ERROR] if any(SYMBOLS in run.steps for _, runs in rows for run in runs) else [ERROR]
+    with _figure(len(rows) * HEIGHT * 0.8, len(rows), len(measures)) as (figure, grid):
+        for i, (title, runs) in enumerate(rows):
+            for axes, measure in zip(grid[i * len(measures) :], measures, strict=False):
+                if measure in runs[0].steps:
+                    _rollouts(axes, runs, measure)
+                else:
+                    axes.set_axis_off()
+            grid[i * len(measures)].set_title(title, loc="left", fontsize=10).set_in_layout(False)  # goes on
+        _legend(figure, columns=4, last=("first frame repeated", "real frame"))
+        return svg_of(figure, "World models beside reality: errors step by step", VARIABLES)
+
+
+def _rollouts(axes: Axes, runs: Sequence[InspectedRun], measure: str) -> None:
+    for agent in sorted({run.agent for run in runs}):  # m1 to m6
+        table = pd.concat([run.steps[measure] for run in runs if run.agent == agent], axis=1)
+        mean_T, low_T, high_T = statistics.sample_efficiency_curve(table.to_numpy())
+        color, dashes, _ = style_of(agent)
+        axes.plot(table.index, mean_T, color=color, linestyle=dashes, label=agent)
+        if table.shape[1] > 1:
+            axes.fill_between(table.index, low_T, high_T, color=color, alpha=0.18, linewidth=0)
+    longest = max((run.steps for run in runs), key=len)
+    bounds = {"first frame repeated": longest[f"repeated_{measure}"], "real frame": longest.get(f"real_{measure}", 0)}
+    for (label, bound), dashes in zip(bounds.items(), ((0, (4, 3)), "-"), strict=True):
+        axes.plot(longest.index, bound + 0 * longest[measure], color=INK, linewidth=0.8, linestyle=dashes, label=label)
+    axes.set(xlabel="steps ahead", ylabel="symbols right, %" if measure == SYMBOLS else "squared error")
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+
+
 def achievement_bars(entries: Sequence[Entry]) -> str:
     """The percentage of training episodes that unlocked each achievement; those that nobody unlocked are left out."""
     names = [name for name in entries[0].spec.achievements if _success(entries, name).any()]
@@ -127,7 +163,7 @@ def achievement_bars(entries: Sequence[Entry]) -> str:
         axes.set(xlabel="episodes that unlocked it, %", xlim=(0, 100), ylim=(-0.6, len(names) - 0.4))
         axes.grid(False, axis="y")
         _legend(figure)
-        return _svg(figure, "Bars: percentage of training episodes that unlocked each achievement")
+        return svg_of(figure, "Bars: percentage of training episodes that unlocked each achievement", VARIABLES)
 
 
 def performance_profiles(scores: Mapping[str, Sequence[np.ndarray]], label: str) -> str:
@@ -141,7 +177,7 @@ def performance_profiles(scores: Mapping[str, Sequence[np.ndarray]], label: str)
             axes.plot(thresholds, share, color=color, linestyle=dashes, label=agent, drawstyle="steps-post")
         axes.set(xlabel=label, ylabel="share of runs above", ylim=(0, 1.03), xlim=(0, thresholds[-1]))
         _legend(figure)
-        return _svg(figure, f"Performance profiles: share of runs whose {label} is above a threshold")
+        return svg_of(figure, f"Performance profiles: share of runs whose {label} is above a threshold", VARIABLES)
 
 
 def time_against_score(points: Sequence[tuple[str, str, float, float]], label: str) -> str:
@@ -168,7 +204,7 @@ def time_against_score(points: Sequence[tuple[str, str, float, float]], label: s
                 verticalalignment="center",
                 arrowprops={"arrowstyle": "-", "color": GRID, "linewidth": 0.6, "shrinkB": 4},
             )
-        return _svg(figure, f"Scatter: {label} against minutes of one run")
+        return svg_of(figure, f"Scatter: {label} against minutes of one run", VARIABLES)
 
 
 def _apart(heights: Sequence[float], gap: float) -> list[float]:
@@ -204,65 +240,18 @@ def _figure(height: float = HEIGHT, rows: int = 1, columns: int = 1) -> Iterator
         yield figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 
-def _legend(figure: Figure) -> None:
-    """Each name once, whichever axes it is in."""
+def _legend(figure: Figure, columns: int = 5, last: Sequence[str] = ()) -> None:
+    """Each name once, whichever axes it is in; some of them after all others."""
     handles: dict[Any, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
+    handles |= {label: handles.pop(label) for label in last}
     figure.legend(
         handles=list(handles.values()),
         labels=list(handles),
         loc="outside upper left",
-        ncols=5,
+        ncols=columns,
         handlelength=1.6,
         columnspacing=1.0,
     )
-
-
-def _svg(figure: Figure, description: str) -> str:
-    """The `<svg>` element, without what belongs to a file of its own."""
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None, "Format": None})
-    text = buffer.getvalue()
-    text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>\s*", "", text, flags=re.DOTALL)
-    text = re.sub(
-        r'<svg [^>]*viewBox="([^"]*)"[^>]*>',
-        rf'<svg viewBox="\1" role="img" aria-label="{description}">',
-        text,
-        count=1,
-    )
-    for color, variable in VARIABLES.items():
-        text = text.replace(color, variable)
-    return _light(text)
-
-
-def _light(svg: str) -> str:
-    """The same picture in far fewer bytes: no names that nothing refers to, coordinates to a tenth of a point."""
-    used = set(re.findall(r'(?:href="#|url\(#)([^")]*)', svg))
-    svg = re.sub(r' id="([^"]*)"', lambda match: match[0] if match[1] in used else "", svg)
-    svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
-    svg = re.sub(r" font-family: [^;\"]*;", "", svg)  # the page's own
-    svg = re.sub(r' transform="rotate\(-0 [^"]*"', "", svg)
-
-    def rounded(match: re.Match[str]) -> str:
-        numbers = re.sub(r"-?[0-9]+\.[0-9]+", lambda number: _short(float(number[0])), match[2])
-        return f'{match[1]}"{_relative(" ".join(numbers.replace("L", "").split()))}"'  # lines follow by themselves
-
-    svg = re.sub(r'( (?:d|x|y|x1|x2|y1|y2|width|height|transform|points)=)"([^"]*)"', rounded, svg)
-    return re.sub(r">\s+<", "><", svg)
-
-
-def _short(value: float) -> str:
-    return f"{value:.1f}".removesuffix(".0")
-
-
-def _relative(path: str) -> str:
-    """A path of lines alone, each point as its distance from the one before, which takes fewer digits."""
-    match = re.fullmatch(r"M ([-0-9. ]*?)( z)?", path)
-    if match is None:
-        return path
-    points = np.array(match[1].split(), dtype=float).reshape(-1, 2)
-    steps = np.diff(points, axis=0, prepend=np.zeros((1, 2)))
-    return f"m {' '.join(map(_short, steps.flat))}{match[2] or ''}".replace(" -", "-")

@@ -19,13 +19,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("leaderboards"), metavar="DIR", help="of the CSVs (default leaderboards)"
     )
     parser.add_argument("--page", type=Path, metavar="DIR", help="also write DIR/index.html, to open with a browser")
+    parser.add_argument(
+        "--plot", type=Path, metavar="FILE", help="also draw there (.svg) what suite inspect found of world models"
+    )
 
 
 def execute(args: argparse.Namespace) -> int:
+    from leaderboards.inspections import inspections_in
     from leaderboards.publish import publish
 
     if args.page is not None and args.page.exists() and not args.page.is_dir():
         raise UserError(f"--page {args.page} is no folder")
+    inspections = inspections_in(args.out)
+    if args.plot is not None:
+        from leaderboards.page.world_models import require_picture, write_picture
+
+        require_picture(args.plot, inspections)
     publication = publish(args.runs or ([RUNS] if RUNS.is_dir() else []), args.out)
     for refusal in publication.refusals:
         print(f"refused {refusal}", file=sys.stderr)
@@ -40,8 +49,11 @@ def execute(args: argparse.Namespace) -> int:
     if args.page is not None:
         from leaderboards.page.page import write_page
 
-        page = write_page(publication.entries, publication.tables, args.page)
+        page = write_page(publication.entries, publication.tables, args.page, inspections)
         print(f"page {page}")
+    if args.plot is not None:
+        write_picture(args.plot, inspections)
+        print(f"plot {args.plot}")
     if args.json:
         fields = {
             "added": [str(folder) for folder in publication.added],

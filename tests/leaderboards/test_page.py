@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import re
 import shutil
 from pathlib import Path
 
+import matplotlib
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
 
 from leaderboards.boards import boards
+from leaderboards.inspections import inspections_in
 from leaderboards.page import page as pages
-from leaderboards.page import plots
+from leaderboards.page import plots, svg
 from leaderboards.page.page import write_page
 from leaderboards.publish import evidence_in
 from leaderboards.results import Entry
+from tests.leaderboards.test_inspections import write_inspection
 
 REPOSITORY = Path(__file__).parents[2]
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -23,19 +31,20 @@ SHOWN = ("craftax_classic", "minatar/breakout")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """The page of a part of what is committed, and what it was made from."""
+    """The page of a part of what is committed, with world models besides, and what it was made from."""
     standings = [s for s in evidence_in(REPOSITORY / "leaderboards")[0] if s.entry.config.task in SHOWN]
     tables = boards(standings)
     folder = tmp_path_factory.mktemp("page")
-    return write_page([s.entry for s in standings], tables, folder), tables, standings
+    write_inspection(folder, {"m5 seed 0": 1.0, "m5 seed 1": 2.0, "m6 seed 0": 0.5}, task=SHOWN[1])
+    return write_page([s.entry for s in standings], tables, folder, inspections_in(folder)), tables, standings
 
 
 def test_it_holds_all_that_it_needs(made):
-    path, *_ = made
+    path, tables, _ = made
     html = path.read_text()
-    assert not re.findall(r'(?:src|href)="(?!#)[^"]*"|url\((?!#)|@import', html)
+    assert not re.findall(r'(?:src|href)="(?!#|data:image/png;base64,)[^"]*"|url\((?!#)|@import', html)
     ids = re.findall(r'\bid="([^"]*)"', html)
-    assert len(ids) == len(set(ids)) > 20
+    assert len(ids) == len(set(ids)) >= len(tables)
     used = set(re.findall(r'(?:href="|url\()#([^")]*)', html))
     assert used <= set(ids)
     assert not any(color in html for color in plots.VARIABLES)  # each stand-in became the page's own colour
@@ -43,7 +52,8 @@ def test_it_holds_all_that_it_needs(made):
 
 def test_the_same_runs_make_the_same_page(made, tmp_path):
     path, _, standings = made
-    again = write_page([Entry(s.entry.records) for s in standings], boards(standings), tmp_path)
+    entries = [Entry(s.entry.records) for s in standings]
+    again = write_page(entries, boards(standings), tmp_path, inspections_in(path.parent))
     assert again.read_bytes() == path.read_bytes()
 
 
@@ -87,7 +97,8 @@ def test_a_published_level_is_a_line_where_budgets_agree(made, tmp_path):
     assert panel.published == (best["method"], best["value"])
     told = [s.entry for s in standings if s.entry.config.agent in ("mfrl", "m6")]
     html = write_page(told, {"overall.csv": tables["overall.csv"], "minatar_breakout.csv": table}, tmp_path).read_text()
-    assert html.count(f"published: {best['method']}") == 2  # in the family's picture, and in the game's
+    assert html.count(f"published: {best['method']}") == 1  # in the family's picture, which is the game's
+    assert '<use href="#picture-' in html
 
 
 @pytest.fixture(scope="module")
@@ -165,6 +176,16 @@ def test_sorting(opened):
     assert names[0].startswith("3-D RoPE") and heading.get_attribute("aria-sort") is None
 
 
+def test_numbers_sort_as_numbers(opened):
+    """Also where they are read off the text: thousands have commas there, and small print follows."""
+    page = opened()
+    for heading in ("Steps", "Seeds", "Minutes"):
+        page.locator("#craftax_classic thead th", has_text=heading).get_by_role("button").click()
+        shown = [text.split()[0] for text in column(page, "craftax_classic", heading) if text]
+        values = [float(text.replace(",", "")) for text in shown]
+        assert values == sorted(values, reverse=True) and values[0] > values[-1]
+
+
 def test_filters_apply_to_all_tables(opened):
     page = opened()
     everything = len(column(page, "craftax_classic", "Method"))
@@ -186,13 +207,80 @@ def test_filters_apply_to_all_tables(opened):
     assert len(column(page, "craftax_classic", "Method")) == everything and page.locator("output").inner_text() == ""
 
 
+def test_world_models_beside_reality(opened, made):
+    """Curves and a filmstrip in the section of their task, filtered by its budget."""
+    page = opened()
+    models = page.locator("#minatar_breakout .models")
+    assert page.locator(".models").count() == 1 and models.locator("figure").count() == 2
+    texts = models.locator("svg text").all_text_contents()
+    for text in ("m5", "m6", "first frame repeated", "real frame", "symbols right, %", "squared error"):
+        assert texts.count(text) == 1
+    assert models.locator("figcaption").first.inner_text() == "After 102,400 real steps; runs: 2 of m5, 1 of m6."
+    strip = models.get_by_role("img", name="Frames of rollouts")
+    file = (made[0].parent / "evidence" / SHOWN[1] / "inspect" / "filmstrip.png").read_bytes()
+    assert base64.b64decode(strip.get_attribute("src").split(",")[1]) == file
+    assert strip.evaluate("(image) => image.complete && image.naturalWidth") == 6 * 60 + 5 * 2
+    assert "steps 0, 1, 2, 3, 4, 5; from above real, m5 seed 0" in models.locator("figcaption").last.inner_text()
+    page.get_by_label("Budget").select_option("1,000,000 steps")
+    assert page.locator("#minatar_breakout").is_visible() and not models.is_visible()
+    page.get_by_label("Budget").select_option("102,400 steps")
+    assert models.is_visible()
+
+
+def test_a_picture_that_is_shown_again_is_written_once(opened):
+    """A family of one game shows what the game does."""
+    page, pictures = opened(), []
+    for id, written in (("overall", True), ("craftax_classic", False)):
+        drawing = page.locator(f"#{id} figure svg").first
+        assert (drawing.locator("text").count() > 5) is written and drawing.locator("use").count() == 1 - written
+        drawing.evaluate("(svg) => { svg.style = 'position: fixed; inset: 0; z-index: 9; background: white'; }")
+        shown = page.screenshot(clip={"x": 0, "y": 0, "width": 544, "height": 350})
+        pictures.append(np.asarray(Image.open(io.BytesIO(shown)).convert("L"), int))
+    assert abs(pictures[0] - pictures[1]).max() < 20 and np.ptp(pictures[0]) > 200
+
+
+def test_few_bytes_are_the_same_picture(browser):
+    """Lines, gaps, markers, areas, bars and turned text, with or without what `svg_of` leaves out."""
+    with matplotlib.rc_context({"svg.fonttype": "none"}):
+        figure = Figure(figsize=(5, 3))
+        axes = figure.subplots()
+        axes.plot([0, 1, 2, 3, 4], [1, 2, np.nan, 2, 5], "s-")
+        axes.fill_between([0, 1, 2], [0, 1, 0], [2, 3, 1], alpha=0.4)
+        axes.barh([1, 2], [3, 2.5])
+        axes.annotate("far", (2, 2), (3, 3), arrowprops={"arrowstyle": "->"})
+        axes.set(xlabel="along & across", ylabel="up", title="two\nlines")
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg")
+        whole = buffer.getvalue()
+        light = svg.as_file(svg.svg_of(figure, "", {}), ":root { --paper: white; }")
+    assert len(light) < len(whole) / 2
+    page = browser.new_page(viewport={"width": 480, "height": 288})
+    pictures = []
+    for text in (whole[whole.index("<svg") :], light):
+        page.set_content(f"<style>* {{ margin: 0; font-family: sans-serif !important; }}</style>{text}")
+        pictures.append(np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("L"), float))
+    page.close()
+    difference = abs(pictures[0] - pictures[1])
+    assert difference.mean() < 0.02 * pictures[0].std() and (difference > 128).mean() < 1e-3
+
+
+def test_tables_need_no_script(browser, made):
+    page = browser.new_context(java_script_enabled=False).new_page()
+    page.goto(made[0].as_uri())
+    rows = page.locator("tr[data-origin]")
+    assert rows.count() > 50 and rows.last.is_visible()
+    page.context.close()
+
+
 UNFOLD = "document.querySelectorAll('details').forEach((details) => { details.open = true; })"
 
 
 def test_a_phone_shows_every_score_and_its_method(opened):
     """Without scrolling sideways; all other columns come when asked for, beside the method, which stays."""
     page = opened(390)
-    cells = "[...document.querySelectorAll('tbody .number:not(.minor), th[scope=row]')].filter((c) => c.offsetWidth)"
+    cells = (
+        "[...document.querySelectorAll('td:not(:nth-last-child(-n+6)), th[scope=row]')].filter((c) => c.offsetWidth)"
+    )
     edges = page.evaluate(f"{cells}.map((cell) => cell.getBoundingClientRect().right)")
     assert len(edges) > 60 and max(edges) <= 390
     minutes = page.locator("#craftax_classic thead th", has_text="Minutes")
@@ -239,7 +327,8 @@ def test_nothing_runs_over_the_edge(opened, width):
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     page.evaluate(UNFOLD)
     figures = "[...document.querySelectorAll('figure svg')]"
-    sizes = page.evaluate(f"{figures}.map((svg) => svg.getBoundingClientRect().width)")
+    pictures = "[...document.querySelectorAll('figure svg, figure img')]"
+    sizes = page.evaluate(f"{pictures}.map((picture) => picture.getBoundingClientRect().width)")
     assert len(sizes) >= 6 and all(200 < size <= width for size in sizes)
     texts = f"{figures}.flatMap((svg) => [...svg.querySelectorAll('text')])"
     heights = page.evaluate(f"{texts}.map((text) => text.getBoundingClientRect().height)")
@@ -266,5 +355,5 @@ def test_screen_readers_have_names_for_everything(opened):
         || [...table.querySelectorAll('tr[data-origin]')].some(
             (row) => row.querySelectorAll('th[scope=row]').length !== 1)).length"""
     assert page.evaluate(nameless) == 0
-    assert page.get_by_role("img").count() == page.locator("figure svg[aria-label]").count() >= 6
+    assert page.get_by_role("img").count() == page.locator("figure svg[aria-label], figure img[alt]").count() >= 6
     assert page.locator("html[lang=en]").count() == page.locator("main").count() == page.locator("h1").count() == 1
