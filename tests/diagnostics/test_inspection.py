@@ -211,6 +211,17 @@ def test_a_small_filmstrip_stays_small():
     assert 10_000 < len(content) <= filmstrips.SMALL_BYTES
 
 
+def test_a_small_filmstrip_has_the_first_run_of_each_agent(runs, tmp_path):
+    records = [RunRecord.open(folder, lock=False) for folder in (runs[0], runs[0], runs[1])]
+    real = evaluation_set.load("corridor", "smoke", QUIET)
+    nothing = np.zeros(real.action.shape)
+    same = rollouts.Rollouts(real.frames[:, 1:], nothing, nothing, real.frames, nothing, nothing, None)
+    names = ["m5 seed 0", "m5 seed 1", "m5_continuous seed 0"]
+    inspection._write_strips(tmp_path, real, dict.fromkeys(names, same), records)
+    with Image.open(tmp_path / "filmstrip.png") as strip:
+        assert strip.info["Description"].endswith("; from above real, m5 seed 0, m5_continuous seed 0.")
+
+
 def test_one_run_of_a_task_without_symbols(tmp_path):
     folder = untrained(tmp_path, "unknown", "m5")
     found = inspection.inspect([folder], None, QUIET)
