@@ -30,7 +30,7 @@ DREAMT = "imagine/"  # dreams are not replayed
 EXACT = 1e-5  # sums of float32 in another order
 # What was learned: rounding, which updates in float32 amplify, those of world models, of which there are hundreds, more
 # than those of policies; other settings differ by far more.
-LEARNED, MODELLED, NOTHING = 0.05, 0.1, 1e-3
+LEARNED, MODELLED, NOTHING = 0.05, 0.15, 1e-3
 # How many codes a VQ-VAE of whole frames uses after its first iteration is chance: of m1's first run parameters that
 # differ by 1e-7 of themselves give 33 instead of 12, and the world model's loss of these tokens is 1.9 instead of 1.3.
 CHAOTIC = 0.75

@@ -90,7 +90,7 @@ FORGERIES = {
     "another seed": (dressed_as("seed"), "episodes.csv"),
     "another agent": (dressed_as("agent"), "metrics.csv lacks world_model/loss"),
     "an episode": (longer, "length is"),
-    "a loss": (metric("world_model/loss", lambda loss: 0.85 * loss), "world_model/loss is"),
+    "a loss": (metric("world_model/loss", lambda loss: 0.8 * loss), "world_model/loss is"),
     "what play paid": (metric("reward_per_step", lambda reward: 1.001 * reward), "reward_per_step is"),
     "a metric of another agent": (
         metric("world_model/copied_share", lambda step: 0 * step + 0.5),
