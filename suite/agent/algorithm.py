@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from suite.agent.phases import Agent
-from suite.agent.state import TrainState
+from suite.agent.state import TrainState, laid_out
 
 Call = Callable[..., Any]
 
@@ -35,17 +35,17 @@ def first_programs(agent: Agent, state: TrainState) -> Iterator[tuple[str, jax.s
 
     Args:
       agent: whose phases they are.
-      state: shapes and dtypes of a fresh state, from `jax.eval_shape`.
+      state: shapes and dtypes of a fresh state, from `jax.eval_shape`, laid out.
     """
-    key = jax.eval_shape(lambda: start_key(0))
+    key = laid_out(jax.eval_shape(lambda: start_key(0)))
     policy_state, replay, tokenizer, world_model = state.policy, state.replay, state.tokenizer, state.world_model
     collected = Agent.collect.lower(agent, policy_state.acting, state.rollout, key)
     yield "collect", collected
-    _, trajectory, _ = collected.out_info
+    trajectory = laid_out(collected.out_info[1])
     if replay is not None:
         yield "remember", Agent.remember.lower(agent, replay, trajectory)
     if agent.learns_from_real:
-        steps = jax.ShapeDtypeStruct((2,), jnp.float32)
+        steps = laid_out(jax.ShapeDtypeStruct((2,), jnp.float32))
         yield "learn", Agent.learn.lower(agent, policy_state, trajectory, steps)
     if world_model is not None and tokenizer is not None:
         yield "tokenizer", Agent.update_tokenizer.lower(agent, tokenizer, replay, key)

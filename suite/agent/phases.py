@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,7 +20,7 @@ from flax import nnx
 from suite.agent import rollout as play
 from suite.agent.dreams import Dreaming
 from suite.agent.replay import Eventful, ReplayState
-from suite.agent.state import TrainState
+from suite.agent.state import TrainState, laid_out
 from suite.interface.tokens import TokenizerState, encode_frame
 from suite.interface.turns import stream_action
 from suite.policy import ppo
@@ -30,6 +31,19 @@ from suite.world_model.sequences import Sequences
 
 Metrics = dict[str, jax.Array]
 IMAGINATION_METRICS = (*ppo.METRICS, "reward_per_step", "termination_rate")
+
+
+def _compiled(donate: int | tuple[()] = ()) -> Callable[[Callable[..., Any]], Any]:
+    """Compiles a method, which may donate the argument of this number; what it returns is laid out."""
+
+    def compiled(method: Callable[..., Any]) -> Any:
+        @functools.wraps(method)
+        def phase(*arguments: Any) -> Any:
+            return laid_out(method(*arguments))
+
+        return jax.jit(phase, static_argnums=0, donate_argnums=donate)
+
+    return compiled
 
 
 class Agent(Dreaming):
@@ -56,7 +70,7 @@ class Agent(Dreaming):
         untrained = self._untrained(policy_key, tokenizer_key, model_key)
         return TrainState(rollout=self.start(untrained["policy"].acting, rollout_key), **untrained)
 
-    @functools.partial(jax.jit, static_argnums=0)
+    @_compiled()
     def _untrained(self, policy_key: jax.Array, tokenizer_key: jax.Array, model_key: jax.Array) -> dict[str, Any]:
         """What a fresh `TrainState` holds besides its rollout."""
         params = nnx.state(self._new_policy(nnx.Rngs(policy_key)))
@@ -73,12 +87,12 @@ class Agent(Dreaming):
             model_state = dataclasses.replace(model_state, measured=jnp.zeros(1 + len(self.tokens.reward_classes)))
         return fresh | {"tokenizer": self.tokenizer.init(tokenizer_key), "world_model": model_state}
 
-    @functools.partial(jax.jit, static_argnums=0)
+    @_compiled()
     def start(self, policy_state: ppo.PolicyTrainState, key: jax.Array) -> play.RolloutState:
         """The start of a rollout in fresh environments; the policy remembers nothing."""
         return play.start(self._policy(policy_state), self.batched, key, self.config.environment.burn_in)
 
-    @functools.partial(jax.jit, static_argnums=0, donate_argnums=2)
+    @_compiled(donate=2)
     def collect(
         self, policy_state: ppo.PolicyTrainState, rollout_state: play.RolloutState, key: jax.Array
     ) -> tuple[play.RolloutState, ppo.Trajectory, play.EpisodeLog]:
@@ -88,12 +102,12 @@ class Agent(Dreaming):
         keep = self.config.imagination.world == "game"
         return play.rollout(key, policy, policy_state.targets, self.batched, rollout_state, config.rollout_length, keep)
 
-    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    @_compiled(donate=1)
     def remember(self, replay: ReplayState, trajectory: ppo.Trajectory) -> ReplayState:
         """Step 1, second line: the real steps enter the replay buffer."""
         return self.replay.add(replay, trajectory, self.spec.pays if self.told_of_pay else None)
 
-    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    @_compiled(donate=1)
     def learn(
         self, policy_state: ppo.PolicyTrainState, trajectory: ppo.Trajectory, steps: jax.Array
     ) -> tuple[ppo.PolicyTrainState, Metrics]:
@@ -111,7 +125,7 @@ class Agent(Dreaming):
             remaining=self.learning_rates_left(steps[0], steps[1]),
         )
 
-    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    @_compiled(donate=1)
     def update_tokenizer(
         self, tokenizer: TokenizerState, replay: ReplayState, key: jax.Array
     ) -> tuple[TokenizerState, Metrics]:
@@ -127,7 +141,7 @@ class Agent(Dreaming):
         tokenizer, metrics = jax.lax.scan(update, tokenizer, keys)
         return tokenizer, {name: values[-1] for name, values in metrics.items()}
 
-    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    @_compiled(donate=1)
     def code(self, replay: ReplayState, tokenizer: NearestNeighborState, known: jax.Array) -> ReplayState:
         """Brings the tokens of stored frames up to date, where they are kept.
 
@@ -141,7 +155,7 @@ class Agent(Dreaming):
             replay, self.lasting_tokenizer, tokenizer, known, self.config.environment.rollout_length
         )
 
-    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    @_compiled(donate=1)
     def update_world_model(
         self,
         model_state: world_model_training.WorldModelTrainState,
@@ -243,7 +257,7 @@ class Agent(Dreaming):
         keys = jax.random.split(key, math.ceil(self.config.steps_per_iteration / steps))
         return jax.lax.map(measure, keys).mean(0)
 
-    @functools.partial(jax.jit, static_argnums=0, donate_argnums=1)
+    @_compiled(donate=1)
     def imagine(
         self,
         policy_state: ppo.PolicyTrainState,

@@ -19,6 +19,7 @@ from suite.configuration.schema import Config
 from suite.interface.environment import EnvironmentSpec, State
 from suite.interface.turns import Turn
 from suite.policy.ppo import Trajectory
+from suite.runtime import layout
 from suite.tokenizers.nearest_neighbor import NearestNeighborState, NearestNeighborTokenizer
 from suite.world_model.history import next_paid, paid_before
 
@@ -158,15 +159,16 @@ class Replay:
           new: so many of the latest steps of each environment have no tokens yet.
         """
         frames, coded = state.experience.observation, state.experience.coded
+        nearer = layout.per_device(tokenizer.nearer, (None, None, 0, 0, 0), 0)
+        nearest = layout.per_device(tokenizer.nearest, (None, 0), 0)
 
         def recode(slot: jax.Array, coded: Coded) -> Coded:
             tokens, distance = coded.tokens[:, slot], coded.distance[:, slot]
-            nearer = tokenizer.nearer(codebook, known, frames[:, slot], tokens, distance)
-            return _written(coded, slot, *nearer)
+            return _written(coded, slot, *nearer(codebook, known, frames[:, slot], tokens, distance))
 
         def code(i: jax.Array, coded: Coded) -> Coded:
             slot = (state.current_index - 1 - i) % self.length
-            return _written(coded, slot, *tokenizer.nearest(codebook, frames[:, slot]))
+            return _written(coded, slot, *nearest(codebook, frames[:, slot]))
 
         coded = jax.lax.fori_loop(0, jnp.where(codebook.count > known, self._stored(state), 0), recode, coded)
         coded = jax.lax.fori_loop(0, new, code, coded)
@@ -187,7 +189,12 @@ class Replay:
         if recent:
             return self._sample_recent(state, key, batch, length, recent)
         with jax.numpy_rank_promotion("allow"):  # flashbax broadcasts as NumPy does
-            return self._buffer(batch, length).sample(state, key).experience
+            if layout.devices() == 1:
+                return self._buffer(batch, length).sample(state, key).experience
+            # Asked for numbers of steps instead of steps, it says which ones it would take.
+            number_EL = jnp.arange(self.num_envs * self.length).reshape(self.num_envs, self.length)
+            number_BT = self._buffer(batch, length).sample(state.replace(experience=number_EL), key).experience
+        return layout.take(state.experience, number_BT[:, 0] // self.length, number_BT % self.length)
 
     def eventful(
         self, state: ReplayState, pays: Callable[[jax.Array], jax.Array], length: int, skipped: int = 0
@@ -207,6 +214,7 @@ class Replay:
         first_L = jnp.arange(self.length)
         count_EL = before_EL[:, (first_L + length - 1) % self.length] - before_EL[:, (first_L + skipped) % self.length]
         holds_EL = (count_EL > 0) & (first_L + length <= self._stored(state))[None]
+        holds_EL = layout.replicated(holds_EL)  # one bit for every step: each device ranks them all
         return Eventful(holds_EL, jnp.cumsum(holds_EL.reshape(-1).astype(jnp.int32)))
 
     def sample_eventful(
@@ -254,7 +262,7 @@ class Replay:
     def _sequences(self, state: ReplayState, row_B: jax.Array, slot_B: jax.Array, length: int) -> Experience:
         """Sequences [B, T] of these environments that begin in these slots, counted modulo the buffer's length."""
         slot_BT = (slot_B[:, None] + jnp.arange(length)[None]) % self.length
-        return jax.tree.map(lambda x: x[row_B[:, None], slot_BT], state.experience)
+        return layout.take(state.experience, row_B, slot_BT)
 
 
 def _uncoded(shape: tuple[int, ...]) -> Coded:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from suite.interface.environment import Environment, EnvironmentSpec, State, TimeStep
 from suite.interface.turns import Turn
+from suite.runtime import layout
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +36,8 @@ class Batched:
 
     def reset(self, key: jax.Array) -> tuple[State, TimeStep]:
         """B fresh episodes; every array leads with B."""
-        return jax.vmap(self._reset)(jax.random.split(key, self.num_envs), jnp.arange(self.num_envs))
+        reset = layout.per_device(jax.vmap(self._reset), (0, 0), 0)
+        return reset(jax.random.split(key, self.num_envs), jnp.arange(self.num_envs))
 
     def step(self, key: jax.Array, state: State, action_B: jax.Array) -> tuple[State, TimeStep]:
         """One step of each environment; those that ended continue at the first frame of a new episode.
@@ -44,6 +46,12 @@ class Batched:
         and `turn` are those of the new episode where one began.
         """
         step_keys_B, reset_keys_B = jax.random.split(key, (2, self.num_envs))
+        return layout.per_device(self._step, (0, 0, 0, 0), 0)(step_keys_B, reset_keys_B, state, action_B)
+
+    def _step(
+        self, step_keys_B: jax.Array, reset_keys_B: jax.Array, state: State, action_B: jax.Array
+    ) -> tuple[State, TimeStep]:
+        """`step` of a device's environments: each device resets its own."""
         state, stepped = jax.vmap(self.environment.step)(step_keys_B, state, action_B)
         ended_B = stepped.terminated | stepped.truncated
         # Indices of the environments that ended come first; the loop visits only those.
@@ -52,7 +60,8 @@ class Batched:
 
         def reset_one(i, carry):
             index = order_B[i]
-            fresh_state, fresh = self._reset(reset_keys_B[index], index)
+            number = layout.row_of_all(index, len(ended_B))
+            fresh_state, fresh = self._reset(reset_keys_B[index], number)
             fresh_shown = {"observation": fresh.observation, "turn": fresh.turn}
             return jax.tree.map(lambda old, new: old.at[index].set(new), carry, (fresh_state, fresh_shown))
 

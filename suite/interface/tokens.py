@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from suite.interface.environment import nearest_level
 from suite.interface.turns import Turn
+from suite.runtime import layout
 
 TokenizerState = Any  # A tokenizer's own pytree of arrays: parameters, codebook, optimizer.
 
@@ -101,12 +102,18 @@ class Tokenizer(Protocol):
         """float32 [K, P]: what each code stands for, in numbers from 0 to 1; P = 0 where codes are only names."""
 
 
-def encode_frame(tokenizer: Tokenizer, state: TokenizerState, observation: jax.Array, turn: Turn | None) -> jax.Array:
-    """int32 tokens [..., L] of a frame: the observation's; in a game player 1's observation, then player 2's."""
-    ours = tokenizer.encode(state, observation)
+def encode_frame(
+    tokenizer: Tokenizer, state: TokenizerState, observation: jax.Array, turn: Turn | None, axis: int = 0
+) -> jax.Array:
+    """int32 tokens [..., L] of a frame: the observation's; in a game player 1's observation, then player 2's.
+
+    `axis` is the batch's among the leading ones: every device encodes its own part of it.
+    """
+    encode = layout.per_device(tokenizer.encode, (None, axis), axis)
+    ours = encode(state, observation)
     if turn is None:
         return ours
-    theirs = tokenizer.encode(state, turn.opponent_observation)
+    theirs = encode(state, turn.opponent_observation)
     first = (turn.seat == 1)[..., None]
     return jnp.concatenate([jnp.where(first, ours, theirs), jnp.where(first, theirs, ours)], axis=-1)
 
@@ -114,10 +121,14 @@ def encode_frame(tokenizer: Tokenizer, state: TokenizerState, observation: jax.A
 def decode_frame(
     tokenizer: Tokenizer, state: TokenizerState, tokens: jax.Array, seat: jax.Array | None
 ) -> tuple[jax.Array, jax.Array | None]:
-    """The inverse: our observation and, where there is a seat (int32 [...], ours), the other player's."""
+    """The inverse: our observation and, where there is a seat (int32 [...], ours), the other player's.
+
+    The batch is the first of the leading axes.
+    """
+    decode = layout.per_device(tokenizer.decode, (None, 0), 0)
     if seat is None:
-        return tokenizer.decode(state, tokens), None
+        return decode(state, tokens), None
     first, second = jnp.split(tokens, 2, axis=-1)
     ours_first = (seat == 1)[..., None]
     ours, theirs = jnp.where(ours_first, first, second), jnp.where(ours_first, second, first)
-    return tokenizer.decode(state, ours), tokenizer.decode(state, theirs)
+    return decode(state, ours), decode(state, theirs)

@@ -19,6 +19,8 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
+from suite.runtime import layout
+
 TILE = 64  # queries, and keys, at a time
 TRITON = triton.CompilerParams(num_warps=4, num_stages=2)
 
@@ -47,7 +49,7 @@ def fused_attention(
     Raises:
       ValueError: a width of heads that the kernel cannot multiply.
     """
-    batch, length, heads, width = query_BSNH.shape
+    _, length, heads, width = query_BSNH.shape
     if width < 16 or width & (width - 1):
         raise ValueError(f"the fused kernel needs heads of width 16, 32, 64 ..., not {width}")
     rate = 0.0 if dropout_key is None else dropout_rate
@@ -55,11 +57,22 @@ def fused_attention(
     padding, interpret = -length % TILE, jax.default_backend() == "cpu" if interpret is None else interpret
 
     def tiled(x_BSNH: jax.Array) -> jax.Array:
-        x_GSH = x_BSNH.swapaxes(1, 2).reshape(batch * heads, length, width)
+        x_GSH = x_BSNH.swapaxes(1, 2).reshape(-1, length, width)
         return jnp.pad(x_GSH, ((0, 0), (0, padding), (0, 0)))
 
-    mixed_GSH = _attention(*map(tiled, (query_BSNH, key_BSNH, value_BSNH)), bits[:1], unit, rate, interpret)
-    return mixed_GSH[:, :length].reshape(batch, heads, length, width).swapaxes(1, 2)
+    def attend(query_BSNH: jax.Array, key_BSNH: jax.Array, value_BSNH: jax.Array, seed_1: jax.Array) -> jax.Array:
+        mixed_GSH = _attention(*map(tiled, (query_BSNH, key_BSNH, value_BSNH)), seed_1, unit, rate, interpret)
+        return mixed_GSH[:, :length].reshape(-1, heads, length, width).swapaxes(1, 2)
+
+    if layout.devices() == 1:
+        return attend(query_BSNH, key_BSNH, value_BSNH, bits[:1])
+
+    def own(query_BSNH: jax.Array, key_BSNH: jax.Array, value_BSNH: jax.Array, seed_1: jax.Array) -> jax.Array:
+        # So that a stream drops what it drops on one device.
+        first = layout.row_of_all(jnp.zeros((), jnp.int32), len(query_BSNH) * heads)
+        return attend(query_BSNH, key_BSNH, value_BSNH, seed_1 + first.astype(jnp.uint32))
+
+    return layout.per_device(own, (0, 0, 0, None), 0)(query_BSNH, key_BSNH, value_BSNH, bits[:1])
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5, 6))

@@ -11,6 +11,7 @@ from flax import nnx, struct
 
 from suite.configuration.schema import PolicyConfig
 from suite.interface.environment import ObservationSpec
+from suite.nn.per_device import of_each_device
 from suite.policy.moon import MoonCNN, MoonTrunk
 from suite.policy.networks import GRU, RELU_GAIN, DenseTrunk, ImpalaCNN, Norm, SymbolMLP, dense
 
@@ -85,6 +86,12 @@ class ActorCritic(nnx.Module):
           hidden_BH: float32; the hidden state before the first step.
           acting_TB: bool; the hidden state does not advance where it is someone else's turn. None: always ours.
         """
+        own = of_each_device(type(self)._outputs, self, (1, 1, 0, 1), (1, 0))
+        return own(observation_TB, first_TB, hidden_BH, acting_TB)
+
+    def _outputs(
+        self, observation_TB: jax.Array, first_TB: jax.Array, hidden_BH: jax.Array, acting_TB: jax.Array | None
+    ) -> tuple[PolicyOutput, jax.Array]:
         features_TBF = self._embed(observation_TB)
         if self.memory is not None:
             y_TBH, hidden_BH = self.memory(features_TBF, first_TB, hidden_BH, acting_TB)
@@ -104,6 +111,13 @@ class ActorCritic(nnx.Module):
         """The hidden state after the given steps; computes neither policy nor value (burn-in of Algorithm 4)."""
         if self.memory is None:
             return hidden_BH
+        own = of_each_device(type(self)._advanced, self, (1, 1, 0, 1), 0)
+        return own(observation_TB, first_TB, hidden_BH, acting_TB)
+
+    def _advanced(
+        self, observation_TB: jax.Array, first_TB: jax.Array, hidden_BH: jax.Array, acting_TB: jax.Array | None
+    ) -> jax.Array:
+        assert self.memory is not None
         _, hidden_BH = self.memory(self._embed(observation_TB), first_TB, hidden_BH, acting_TB)
         return hidden_BH
 

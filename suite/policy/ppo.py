@@ -7,6 +7,7 @@ Shapes: T steps, B environments, A actions, H memory units. In two-player games 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from suite.interface.turns import Turn
 from suite.nn.masked import masked_mean
 from suite.nn.optimizer import clipped
 from suite.policy.actor_critic import PolicyOutput, log_probability, mask_logits
+from suite.runtime import layout
 
 # What `update` reports, in the order of tables and files.
 METRICS: tuple[str, ...] = (
@@ -233,7 +235,6 @@ def update(
     environments = trajectory.hidden_BH.shape[0]
     if environments % minibatches:
         raise ValueError(f"{minibatches} minibatches do not divide {environments} environments")
-    size = environments // minibatches
     advantage_TB, known_TB = generalized_advantages(trajectory, ppo.discount, ppo.gae_lambda)
     mean, std, _ = _moments(advantage_TB, known_TB)
     batch = _Batch(
@@ -248,9 +249,11 @@ def update(
         legal_TBA=trajectory.legal_TBA,
     )
 
+    minibatch = _minibatches(batch, trajectory.hidden_BH, minibatches)
+
     def minibatch_update(policy_state: PolicyTrainState, inputs: tuple[jax.Array, jax.Array | None]):
         index, rate = inputs
-        part, hidden_BH = _environments(batch, trajectory.hidden_BH, index * size, size)
+        part, hidden_BH = minibatch(index)
         targets = policy_state.targets.update(part.target_TB, part.known_TB, ppo.target_decay)
         part = dataclasses.replace(part, target_TB=targets.standardize(part.target_TB))
 
@@ -296,10 +299,33 @@ class _Batch:
     legal_TBA: jax.Array | None
 
 
-def _environments(batch: _Batch, hidden_BH: jax.Array, start: jax.Array, size: int) -> tuple[_Batch, jax.Array]:
-    """Environments [start, start + size) of both. A slice inside the loop, so that no second copy is made."""
-    part = jax.tree.map(lambda x_TB: jax.lax.dynamic_slice_in_dim(x_TB, start, size, axis=1), batch)
-    return part, jax.lax.dynamic_slice_in_dim(hidden_BH, start, size, axis=0)
+def _minibatches(batch: _Batch, hidden_BH: jax.Array, number: int) -> Callable[[jax.Array], tuple[_Batch, jax.Array]]:
+    """What gives the minibatch of an index (int32): so many contiguous groups of environments.
+
+    On one device a slice, made inside the loop, so that there is no second copy. A group may lie on one of many
+    devices: there environments are moved once, before the loop, so that each device has an equal part of every group.
+    """
+    size = len(hidden_BH) // number
+    if layout.devices() == 1:
+
+        def sliced(index: jax.Array) -> tuple[_Batch, jax.Array]:
+            start = index * size
+            part = jax.tree.map(lambda x_TB: jax.lax.dynamic_slice_in_dim(x_TB, start, size, axis=1), batch)
+            return part, jax.lax.dynamic_slice_in_dim(hidden_BH, start, size, axis=0)
+
+        return sliced
+
+    def grouped(tree: Any, axis: int) -> Any:
+        groups = jax.tree.map(lambda x: x.reshape(*x.shape[:axis], number, size, *x.shape[axis + 1 :]), tree)
+        return layout.split(groups, axis + 1)
+
+    batch_TMB, hidden_MBH = grouped(batch, 1), grouped(hidden_BH, 0)
+
+    def taken(index: jax.Array) -> tuple[_Batch, jax.Array]:
+        part = jax.tree.map(lambda x_TMB: jax.lax.dynamic_index_in_dim(x_TMB, index, 1, keepdims=False), batch_TMB)
+        return part, jax.lax.dynamic_index_in_dim(hidden_MBH, index, 0, keepdims=False)
+
+    return taken
 
 
 def _loss(

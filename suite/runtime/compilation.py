@@ -137,7 +137,9 @@ class Ahead:
 
     def begin(self, programs: Iterable[tuple[str, jax.stages.Lowered]]) -> None:
         """Compiles them in threads of its own: programs by name, in the order in which they are needed."""
-        self._traced = self._pool.submit(self._trace, programs)
+        from suite.runtime import layout
+
+        self._traced = self._pool.submit(self._trace, programs, layout.mesh())
         self._traced.add_done_callback(lambda _: self._notify())
 
     def wait(self, name: str) -> None:
@@ -153,10 +155,13 @@ class Ahead:
         """Begins no more of them; those that are being compiled are not interrupted."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def _trace(self, programs: Iterable[tuple[str, jax.stages.Lowered]]) -> None:
-        for name, lowered in programs:
-            self._compiled[name] = self._pool.submit(lowered.compile)
-            self._notify()
+    def _trace(self, programs: Iterable[tuple[str, jax.stages.Lowered]], mesh: jax.sharding.Mesh | None) -> None:
+        from suite.runtime import layout
+
+        with layout.same(mesh):
+            for name, lowered in programs:
+                self._compiled[name] = self._pool.submit(lowered.compile)
+                self._notify()
 
     def _notify(self) -> None:
         with self._changed:

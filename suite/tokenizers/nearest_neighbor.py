@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from suite.interface.environment import ObservationSpec
+from suite.runtime import layout
 from suite.tokenizers.patches import join_patches, patch_grid, split_patches
 
 # Distances held at once: 64 MiB. On a CPU 4 MiB, which its caches hold: a tenth of the time.
@@ -91,8 +92,10 @@ class NearestNeighborTokenizer:
         """Examines every patch in order and stores those farther than `threshold` from all codes before them.
 
         Equal to examining them one after another, at the price of one iteration per new code. The metrics'
-        distances are squared, of all patches to their nearest code afterwards.
+        distances are squared, of all patches to their nearest code afterwards. Every device examines all patches, which
+        are few: codes are added one by one, each of which depends on those before.
         """
+        observation_NO = layout.replicated(observation_NO)
         patches_MP = split_patches(observation_NO, self.patch).reshape(-1, state.codes_KP.shape[-1])
         distance_M, _ = self._nearest(state, patches_MP)
         limit = jnp.float32(self.threshold * self.observation.high**2)

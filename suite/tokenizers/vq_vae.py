@@ -18,6 +18,7 @@ from flax import nnx, struct
 
 from suite.configuration.schema import TokenizerConfig
 from suite.interface.environment import ObservationSpec
+from suite.nn.per_device import of_each_device
 from suite.tokenizers.autoencoders import FrameDecoder, FrameEncoder, PatchDecoder, PatchEncoder, latent_grid
 from suite.tokenizers.patches import patch_grid
 
@@ -55,6 +56,11 @@ class VQVAE(nnx.Module):
         """float32 [N, L, D], unit norm, of frames in [0, 1]."""
         return unit(self.encoder(frame_NHWC))
 
+    def frames(self, z_NLD: jax.Array) -> jax.Array:
+        """Frames [N, H, W, C], about in [0, 1], of latents or codes."""
+        frame_NHWC: jax.Array = self.decoder(z_NLD)
+        return frame_NHWC
+
     def nearest(self, z_NLD: jax.Array) -> jax.Array:
         """int32 [N, L]: the codes nearest to latents of unit norm."""
         return jnp.argmax(z_NLD @ self.codes().T, axis=-1).astype(jnp.int32)
@@ -72,11 +78,11 @@ def vq_losses(
 
     The decoder's gradient passes the quantization straight through to the latents.
     """
-    z_NLD = model.latents(frame_NHWC)
+    z_NLD = of_each_device(VQVAE.latents, model, (0,), 0)(frame_NHWC)
     code_NL = model.nearest(z_NLD)
     quantized_NLD = model.codes()[code_NL]
     straight_NLD = z_NLD + jax.lax.stop_gradient(quantized_NLD - z_NLD)
-    error = frame_NHWC - model.decoder(straight_NLD)
+    error = frame_NHWC - of_each_device(VQVAE.frames, model, (0,), 0)(straight_NLD)
     parts = {
         "absolute_error": jnp.abs(error).mean(),
         "squared_error": jnp.square(error).mean(),
@@ -155,7 +161,7 @@ class VQTokenizer:
     def decode(self, state: VQState, tokens: jax.Array) -> jax.Array:
         """uint8 [..., H, W, C]."""
         model, high = self._model(state), self.observation.high
-        frame_NHWC = model.decoder(model.codes()[tokens.reshape(-1, self.tokens_per_frame)])
+        frame_NHWC = model.frames(model.codes()[tokens.reshape(-1, self.tokens_per_frame)])
         pixels = jnp.round(jnp.clip(frame_NHWC, 0, 1) * high).astype(jnp.uint8)
         return pixels.reshape(*tokens.shape[:-1], *self.observation.shape)
 

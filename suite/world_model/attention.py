@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from suite.nn.dropout import dropout
+from suite.runtime import layout
 
 GROUPS = 10
 
@@ -80,9 +81,8 @@ def cached_attention(
     if query_BQNH.shape[1] == 1:
         return attend_cached(query_BQNH, key_BNSH, value_BNSH, visible_QS)
     # A CPU's caches hold the scores of one stream, not those of all: one after the other is twice as fast and more.
-    return jax.lax.platform_dependent(
-        query_BQNH, key_BNSH, value_BNSH, visible_QS, cpu=_attend_cached_in_turn, default=attend_cached
-    )
+    in_turn = layout.per_device(_attend_cached_in_turn, (0, 0, 0, None), 0)
+    return jax.lax.platform_dependent(query_BQNH, key_BNSH, value_BNSH, visible_QS, cpu=in_turn, default=attend_cached)
 
 
 def attend_cached(query_BQNH, key_BNSH, value_BNSH, visible_QS) -> jax.Array:

@@ -45,8 +45,11 @@ def neighbourhood(x: jax.Array, grid: tuple[int, int], radius: int, axis: int, f
 
 def inside(grid: tuple[int, int], radius: int) -> np.ndarray:
     """Bool [L, S]: whether a source stands within the frame."""
-    with jax.ensure_compile_time_eval():
-        return np.asarray(neighbourhood(jnp.ones(grid[0] * grid[1], jnp.int32), grid, radius, 0)) > 0
+    row_L, column_L = np.divmod(np.arange(grid[0] * grid[1]), grid[1])
+    offset = np.arange(-radius, radius + 1)
+    row_LR, column_LR = row_L[:, None] + offset, column_L[:, None] + offset
+    rows, columns = ((x >= 0) & (x < size) for x, size in ((row_LR, grid[0]), (column_LR, grid[1])))
+    return (rows[:, :, None] & columns[:, None, :]).reshape(len(row_L), -1)
 
 
 def mixture_loss(

@@ -116,7 +116,8 @@ class Dream:
         turn_PB, action_PB = self.past.turn_PB, self.past.action_PB
         tokens_PBL = self.past.tokens_PBL
         if tokens_PBL is None:
-            tokens_PBL = encode_frame(self.tokenizer, self.tokenizer_state, self.past.observation_PBO, turn_PB)
+            observation_PBO = self.past.observation_PBO
+            tokens_PBL = encode_frame(self.tokenizer, self.tokenizer_state, observation_PBO, turn_PB, axis=1)
         if turn_PB is not None:
             action_PB = stream_action(turn_PB, action_PB)
         tokens_BPL, action_BP, age_BPL = tokens_PBL.swapaxes(0, 1), action_PB.swapaxes(0, 1), None

@@ -16,6 +16,7 @@ from suite.interface.tokens import TokenSpec
 from suite.interface.turns import CHANCE, Turn
 from suite.nn.masked import masked_mean
 from suite.nn.optimizer import clipped
+from suite.nn.per_device import of_each_device
 from suite.world_model.correspondence import mixture_loss
 from suite.world_model.heads import TurnLogits
 from suite.world_model.sequences import Sequences
@@ -277,7 +278,13 @@ def _token_losses(
 
     The logits of a chunk are dropped and computed again for the backward pass, so that never are there B * T * L * K.
     """
+    own = of_each_device(_own_token_losses, model, (0, 0, 0), 0)
+    return own(hidden_BTSD, target_BTL, frame_BTL)
 
+
+def _own_token_losses(
+    model: WorldModel, hidden_BTSD: jax.Array, target_BTL: jax.Array, frame_BTL: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     @jax.checkpoint
     def chunk_losses(hidden: jax.Array, target: jax.Array, frame: jax.Array) -> tuple[jax.Array, ...]:
         predicted = model.observation_logits(hidden)
