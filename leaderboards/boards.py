@@ -227,7 +227,8 @@ def _each(words: Iterable[str]) -> str:
 
 
 def _device(fields: DeviceFields) -> str:
-    return f"{fields.cpu_cores} CPU cores" if fields.platform == "cpu" else fields.kind
+    kind = f"{fields.cpu_cores} CPU cores" if fields.platform == "cpu" else fields.kind
+    return kind if fields.count == 1 else f"{fields.count} devices ({kind})"
 
 
 def _packages(fields: RecordFields) -> str:

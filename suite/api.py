@@ -9,7 +9,7 @@ import dataclasses
 import functools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -61,6 +61,7 @@ def train(
     resume: bool = False,
     callbacks: Iterable[Callback] = (),
     wandb: str | None = None,
+    devices: int | Literal["all"] | None = None,
     progress: bool = False,
 ) -> Run:
     """Trains an agent, or goes on with a run that was stopped: `suite run` calls this for each seed.
@@ -75,6 +76,7 @@ def train(
       callbacks: each is called after every iteration with what it left (`suite.runs.training.Iteration`). If one
         returns True, the run stops with a checkpoint, and the same call goes on with it.
       wandb: the project at Weights & Biases that gets curves, beside TensorBoard's; None: it gets none.
+      devices: on how many of this process's its batches are split; None: one CPU, or as many accelerators as fit.
       progress: whether progress is shown.
 
     Raises:
@@ -83,7 +85,7 @@ def train(
     """
     _begin()
     config = registry.resolve(task, agent, preset, settings or (), seed, steps)
-    result = training.run(config, Path(out), _reporter(progress), resume, callbacks=tuple(callbacks), wandb=wandb)
+    result = training.run(config, Path(out), _reporter(progress), resume, tuple(callbacks), wandb, devices)
     return Run(RunRecord.open(result.folder, lock=False), result)
 
 

@@ -24,19 +24,21 @@ from suite.benchmarks.comparisons import (
 from suite.benchmarks.flops import count_flops
 from suite.configuration.schema import Config
 from suite.records.record import peak_memory
+from suite.runtime import layout
 from suite.runtime.compilation import enable_compilation_cache
 from suite.runtime.reporting import Reporter
 
 MODEL_UPDATES = 2  # measured of the tokenizer's and the world model's, then scaled: on a CPU one can take seconds
 
 
-def bench(config: Config, reporter: Reporter, start_up: bool = True) -> dict[str, Any]:
+def bench(config: Config, reporter: Reporter, start_up: bool = True, devices: int = 1) -> dict[str, Any]:
     """Measures a configuration on this machine. Run it alone: it shares its numbers with whatever else runs.
 
     Args:
       config: what to measure.
       reporter: where progress goes.
       start_up: also start the same command twice in new processes, with an empty and a filled cache.
+      devices: between how many the phases' batches are split; then it says how fast they are on one, too.
 
     Returns:
       tables and numbers by title, for printing.
@@ -54,7 +56,12 @@ def bench(config: Config, reporter: Reporter, start_up: bool = True) -> dict[str
     }
     report: dict[str, Any] = {f"matrix products, {kind} (GFLOP/s)": rate / 1e9 for kind, rate in peak.items()}
     agent = Agent(measured, environment)
-    phases = phase_table(agent, config, peak, reporter)
+    with layout.over(jax.local_devices()[:devices]):
+        phases = phase_table(agent, config, peak, reporter)
+    if devices > 1:
+        reporter.message("measuring the same on one device")
+        for row, alone in zip(phases, phase_table(agent, config, peak, reporter), strict=True):
+            row["times one device's speed"] = alone["ms"] / row["ms"]
     report["phases of one iteration"] = phases
     report |= _summary(config, agent, phases)
     reporter.message("comparing ways to reset the environment")
@@ -114,7 +121,7 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
                 "ms": 1e3 * seconds * scales.get(phase, 1),
                 "share %": 0.0,
                 "GFLOP/s": flops / seconds / 1e9,
-                "% of matmul": 100 * flops / seconds / peak[kind],
+                "% of matmul": 100 * flops / seconds / (peak[kind] * layout.devices()),
             }
         )
         return holder[0]

@@ -6,6 +6,8 @@ import argparse
 import re
 from collections.abc import Callable
 
+from suite.runtime.errors import UserError
+
 MOST = 2**31 - 1  # of what is counted: arrays are indexed by 32 bits
 SEEDS = 10_000  # in one command
 
@@ -39,6 +41,55 @@ def add_wandb(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--wandb", metavar="PROJECT", help="curves at Weights & Biases too (offline: WANDB_MODE=offline)"
     )
+
+
+def add_devices(parser: argparse.ArgumentParser) -> None:
+    """The option for the number of devices."""
+    parser.add_argument(
+        "--devices",
+        type=_devices,
+        metavar="N",
+        help="of this machine, between which batches are split, or all (default: one CPU; all accelerators that fit)",
+    )
+
+
+def add_processes(parser: argparse.ArgumentParser) -> None:
+    """The options for several processes that train one run."""
+    parser.add_argument(
+        "--coordinator",
+        type=_coordinator,
+        metavar="A",
+        help="several processes train one run: HOST:PORT of the first one, or auto (under SLURM or MPI)",
+    )
+    parser.add_argument("--processes", type=whole(1), metavar="N", help="so many, each started with this command")
+    parser.add_argument("--process", type=whole(0), metavar="I", help="which one this is, from 0")
+
+
+def join_processes(args: argparse.Namespace) -> None:
+    """Meets the other processes, if there are to be any; all but the first are quiet."""
+    given = [args.processes is not None, args.process is not None]
+    if args.coordinator is None or args.coordinator == "auto":
+        if any(given):
+            raise UserError("--processes and --process belong to --coordinator HOST:PORT, the address of process 0")
+    elif not all(given) or args.process >= args.processes:
+        raise UserError(
+            f"--coordinator {args.coordinator} needs --processes N and --process I, I from 0 to N - 1, another for each"
+        )
+    if args.coordinator is not None:
+        from suite.runtime import processes
+
+        processes.join(args.coordinator, args.processes, args.process)
+        args.quiet = args.quiet or not processes.is_first()
+
+
+def _coordinator(text: str) -> str:
+    if text != "auto" and not re.fullmatch(r"\S+:[0-9]{1,5}", text):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither HOST:PORT nor auto")
+    return text
+
+
+def _devices(text: str) -> int | str:
+    return "all" if text == "all" else whole(1)(text)
 
 
 def require_wandb_of(args: argparse.Namespace) -> None:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 
-from suite.commands.configuration import add_configuration as add_arguments
+from suite.commands.configuration import add_configuration, add_devices
 from suite.commands.list import published
 from suite.commands.printing import make_reporter, print_json, print_table
 
-__all__ = ["SUMMARY", "add_arguments", "execute"]
-
 SUMMARY = "the whole configuration, layers and parameter counts, without running anything"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add_configuration(parser)
+    add_devices(parser)
 
 
 def execute(args: argparse.Namespace) -> int:
@@ -19,12 +22,16 @@ def execute(args: argparse.Namespace) -> int:
     layers = registry.layers(args.task, args.agent, args.preset, args.overrides, 0, args.steps)
 
     from suite.diagnostics.describe import describe
+    from suite.runs.devices import chosen, require_equal_shares
     from suite.runs.saved_model import agent_for
 
     config, state = layers[-1][1], None
+    if isinstance(args.devices, int):  # of whatever machine
+        require_equal_shares(config, args.devices)
+    devices = args.devices if isinstance(args.devices, int) else chosen(config, args.devices)
     if config.imagination.world == "game":  # only then is the game itself looked at
         state = agent_for(config, make_reporter(args.json)).kept_state
-    description = describe(layers, registry.task(args.task).spec(), state)
+    description = describe(layers, registry.task(args.task).spec(), state, devices)
     if args.json:
         print_json(description.as_dict())
         return 0

@@ -22,12 +22,13 @@ def make_reporter(quiet: bool) -> Reporter:
     return QuietReporter() if quiet else RichReporter()
 
 
-def device_name() -> str:
-    """What JAX computes on."""
+def device_name(count: int = 1) -> str:
+    """What JAX computes on, so many of them."""
     import jax
 
     device = jax.devices()[0]
-    return f"{os.cpu_count()} CPU cores" if device.platform == "cpu" else device.device_kind
+    name = f"{os.cpu_count()} CPU cores" if device.platform == "cpu" else device.device_kind
+    return name if count == 1 else f"{count} devices ({name})"
 
 
 def print_scores(scores: Mapping[str, Any]) -> None:

@@ -7,8 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from suite.commands.configuration import add_configuration, add_wandb, parse_seeds, require_wandb_of
-from suite.commands.printing import device_name, print_json, print_scores, score_line
+from suite.commands.configuration import (
+    add_configuration,
+    add_devices,
+    add_processes,
+    add_wandb,
+    join_processes,
+    parse_seeds,
+    require_wandb_of,
+)
+from suite.commands.printing import device_name, make_reporter, print_json, print_scores, score_line
 from suite.interface.scores import ScoreName
 from suite.runtime.errors import UserError
 
@@ -25,12 +33,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     seeds.add_argument("--seed", type=int, default=0, metavar="N", help="of all randomness (default 0)")
     seeds.add_argument("--seeds", type=parse_seeds, metavar="N-M", help="several, one after another: 0-2 or 0,3,5")
     parser.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where records go (default runs)")
+    add_devices(parser)
     add_wandb(parser)
+    add_processes(parser)
     parser.add_argument("--resume", action="store_true", help="fail if there is no run to go on with")
     parser.add_argument("--quiet", action="store_true", help="no progress")
 
 
 def execute(args: argparse.Namespace) -> int:
+    join_processes(args)
+
     from suite import registry
     from suite.records.record import RunRecord, require_writable, run_folder
 
@@ -41,6 +53,10 @@ def execute(args: argparse.Namespace) -> int:
     if args.resume and not any(begun):
         raise UserError(f"nothing to resume in {folders[0]}: run without --resume to start there")
     require_wandb_of(args)
+
+    from suite.runs.devices import used
+
+    devices = len(used(configs[0], args.devices, make_reporter(args.quiet)))
     require_writable(args.out)
     for folder, config, exists in zip(folders, configs, begun, strict=True):
         if exists:  # so that the last seed's folder is known to be right before the first one's run starts
@@ -52,7 +68,7 @@ def execute(args: argparse.Namespace) -> int:
     for folder, config, exists in zip(folders, configs, begun, strict=True):
         if not args.quiet:
             what = f"{config.task}, agent {config.agent}, preset {config.preset}, seed {config.seed}"
-            print(f"{what}, on {device_name()}; files in {folder}", flush=True)
+            print(f"{what}, on {device_name(devices)}; files in {folder}", flush=True)
         result = api.train(
             args.task,
             args.agent,
@@ -63,6 +79,7 @@ def execute(args: argparse.Namespace) -> int:
             out=args.out,
             resume=args.resume and exists,
             wandb=args.wandb,
+            devices=args.devices,
             progress=not args.quiet,
         ).result
         results.append(result)

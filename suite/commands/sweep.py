@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from suite.commands.configuration import add_wandb, parse_seeds, require_wandb_of, whole
+from suite.commands.configuration import add_devices, add_wandb, parse_seeds, require_wandb_of, whole
 from suite.commands.printing import print_json, print_table, score_line
 from suite.runtime.errors import UserError
 
@@ -48,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--retries", type=whole(0), metavar="N", help="of a run that failed or died (default: 2 if it died, else 0)"
     )
+    add_devices(parser)
     add_wandb(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress")
     parser.add_argument(
@@ -74,7 +75,10 @@ def execute(args: argparse.Namespace) -> int:
         from suite.runs.sweep_ray import compute_types
 
         overrides, out = [*compute_types(args.gpus or 0), *overrides], out.absolute()
-    runs = sweep.plan(args.tasks, args.agents, args.seeds, args.preset, overrides, args.steps, out, args.wandb)
+    runs = sweep.plan(
+        args.tasks, args.agents, args.seeds, args.preset, overrides, args.steps, out, args.wandb, args.devices
+    )
+    _require_devices(runs, args.devices, on_ray)
     if any(run.status == "waiting" for run in runs):
         with _engine(args) as (start, jobs, where):
             if not args.quiet:
@@ -86,6 +90,20 @@ def execute(args: argparse.Namespace) -> int:
         print_json({"runs": [_fields(run) for run in runs]})
     statuses = {run.status for run in runs}
     return STOPPED if statuses & {"waiting", "stopped"} else FAILED if "failed" in statuses else 0
+
+
+def _require_devices(runs: Sequence[Run], asked: Any, on_ray: bool) -> None:
+    """Raises a UserError if a run cannot use so many devices; how many nodes of Ray have only they know."""
+    from suite.runs.devices import chosen, require_equal_shares
+
+    for run in runs:
+        try:
+            if not on_ray:
+                chosen(run.config, asked)
+            elif isinstance(asked, int):
+                require_equal_shares(run.config, asked)
+        except UserError as error:
+            raise UserError(f"{run.config.task}, agent {run.config.agent}: {error}") from error
 
 
 def _require_ray() -> None:

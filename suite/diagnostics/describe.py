@@ -83,13 +83,16 @@ class Description:
         }
 
 
-def describe(layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec, state: State = None) -> Description:
+def describe(
+    layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec, state: State = None, devices: int = 1
+) -> Description:
     """Describes the configuration that `suite.registry.layers` made for a task of this specification.
 
     Args:
       layers: the configuration after each source's changes.
       spec: the task's.
       state: the shapes of one environment's state, where the replay buffer keeps states.
+      devices: between how many the replay buffer is split.
     """
     config = layers[-1][1]
     policy = nnx.eval_shape(
@@ -101,7 +104,7 @@ def describe(layers: Sequence[tuple[Source, Config]], spec: EnvironmentSpec, sta
         world_model = nnx.eval_shape(lambda: WorldModel(config.world_model, tokens, grid, nnx.Rngs(0)))
         modules["world_model"] = _layers(world_model)
         modules |= _tokenizer_modules(jax.eval_shape(tokenizer.init, jax.random.key(0)))
-    return Description(_settings(layers), modules, _derived(config, spec) + _memory(config, spec, state))
+    return Description(_settings(layers), modules, _derived(config, spec) + _memory(config, spec, state, devices))
 
 
 def _settings(layers: Sequence[tuple[Source, Config]]) -> list[Setting]:
@@ -136,7 +139,7 @@ def _group(tree: Any) -> list[Layer]:
     return [Layer(name, arrays) for name, arrays in shapes.items()]
 
 
-def _memory(config: Config, spec: EnvironmentSpec, state: State) -> list[tuple[str, int, str]]:
+def _memory(config: Config, spec: EnvironmentSpec, state: State, devices: int) -> list[tuple[str, int, str]]:
     """What the replay buffer takes."""
     if not config.dreams:
         return []
@@ -144,7 +147,11 @@ def _memory(config: Config, spec: EnvironmentSpec, state: State) -> list[tuple[s
     arrays = jax.tree.leaves(jax.eval_shape(lambda: replay.init(spec, state)))
     held = sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays)
     how = "frames, actions and the rest" + (" and the environments' own states" if state is not None else "")
-    return [("replay memory (MiB)", held // 2**20, f"{how} of {replay.num_envs} x {replay.length} steps")]
+    memory = [("replay memory (MiB)", held // 2**20, f"{how} of {replay.num_envs} x {replay.length} steps")]
+    if devices > 1:
+        shared = f"the steps of {replay.num_envs // devices} environments; networks are whole on each"
+        memory.append(("replay memory of each device (MiB)", held // devices // 2**20, shared))
+    return memory
 
 
 def _derived(config: Config, spec: EnvironmentSpec) -> list[tuple[str, int, str]]:

@@ -79,7 +79,8 @@ def restore_latest(folder: Path, model_template: Any, resume_template: Any = Non
 
     Args:
       folder: of all the run's checkpoints.
-      model_template: arrays or `jax.ShapeDtypeStruct`s in the structure that was saved.
+      model_template: arrays or `jax.ShapeDtypeStruct`s in the structure that was saved. What is split between
+        devices in it is restored so.
       resume_template: likewise; None: `resume` is not read.
 
     Raises:
@@ -147,7 +148,14 @@ def _orbax() -> Iterator[Any]:
     import orbax.checkpoint as ocp
 
     _quiet_orbax()
-    checkpointer = ocp.Checkpointer(ocp.PyTreeCheckpointHandler(use_ocdbt=True, use_zarr3=True))
+    # Each process for itself: of several that train one run together the first one saves, and all of them restore.
+    me = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process_{me}"
+    )
+    options: dict[str, Any] = {} if jax.process_count() == 1 else {"multiprocessing_options": alone}
+    handler = ocp.PyTreeCheckpointHandler(use_ocdbt=True, use_zarr3=True, **options)
+    checkpointer = ocp.Checkpointer(handler, **options)
     try:
         yield checkpointer
     finally:
@@ -184,10 +192,12 @@ def _save_tree(path: Path, tree: Any) -> None:
 def _restore_tree(path: Path, template: Any) -> Any:
     import orbax.checkpoint as ocp
 
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     flat, structure = jax.tree_util.tree_flatten_with_path(template)
+    places = {name: leaf.sharding for name, leaf in _leaves(template).items() if _is_placed(leaf)}
     wanted = {
-        name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device) for name, leaf in _leaves(template).items()
+        name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=places.get(name, device))
+        for name, leaf in _leaves(template).items()
     }
     arrays: dict[str, Any] = {}
     with _orbax() as checkpointer:
@@ -197,11 +207,20 @@ def _restore_tree(path: Path, template: Any) -> Any:
                 raise UserError(f"{path} does not fit this version or configuration: {misfit}")
             arguments = ocp.checkpoint_utils.construct_restore_args(wanted)
             arrays = checkpointer.restore(path.absolute(), args=ocp.args.PyTreeRestore(wanted, restore_args=arguments))
+    arrays = {name: array if name in places else _unbound(array) for name, array in arrays.items()}
+    leaves = [arrays.get(jax.tree_util.keystr(key)) for key, _ in flat]
     leaves = [
-        _unbound(arrays[name]) if (name := jax.tree_util.keystr(key)) in arrays else jnp.zeros(leaf.shape, leaf.dtype)
-        for key, leaf in flat
+        jnp.zeros(leaf.shape, leaf.dtype) if array is None else array
+        for array, (_, leaf) in zip(leaves, flat, strict=True)
     ]
     return jax.tree_util.tree_unflatten(structure, leaves)
+
+
+def _is_placed(leaf: Any) -> bool:
+    """Whether a template says on which of this process's devices it is to be: no one of them need hold all of it."""
+    sharding = getattr(leaf, "sharding", None)
+    key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return isinstance(sharding, jax.sharding.NamedSharding) and sharding.is_fully_addressable and not key
 
 
 def _unbound(array: jax.Array) -> jax.Array:

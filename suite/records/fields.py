@@ -47,11 +47,12 @@ class ProtocolFields(_Part):
 
 
 class DeviceFields(_Part):
-    """What was computed on."""
+    """What was computed on. It is no part of the protocol: results of one device and of several compare."""
 
     platform: str
     kind: str
     cpu_cores: PositiveInt | None
+    count: PositiveInt = 1  # of devices; records of earlier versions, which had one, do not say
 
 
 class RecordFields(_Part):

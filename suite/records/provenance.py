@@ -14,15 +14,22 @@ PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "flashbax", "n
 
 
 def provenance() -> dict[str, Any]:
-    """Versions, commit and device, as they stand in record.json."""
+    """Versions, commit and devices, as they stand in record.json."""
     import jax
+
+    from suite.runtime import layout
 
     device = jax.devices()[0]
     return {
         "python": platform.python_version(),
         "packages": {name: package_version(name) for name in PACKAGES},
         "git_commit": _git_commit(),
-        "device": {"platform": device.platform, "kind": device.device_kind, "cpu_cores": os.cpu_count()},
+        "device": {
+            "platform": device.platform,
+            "kind": device.device_kind,
+            "cpu_cores": os.cpu_count(),
+            "count": layout.devices(),
+        },
     }
 
 
@@ -31,7 +38,7 @@ def peak_memory() -> dict[str, int]:
     import jax
 
     peaks = {"process": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024}  # Linux counts in KiB
-    statistics = jax.devices()[0].memory_stats() or {}
+    statistics = jax.local_devices()[0].memory_stats() or {}
     if "peak_bytes_in_use" in statistics:
         peaks["device"] = statistics["peak_bytes_in_use"]
     return peaks

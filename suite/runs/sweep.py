@@ -27,6 +27,7 @@ from typing import Any, Protocol
 from suite import registry
 from suite.configuration.schema import Config
 from suite.records.record import RunRecord, require_writable, run_folder
+from suite.runs.devices import Asked
 from suite.runtime.compilation import device_kind
 from suite.runtime.errors import FolderInUseError, UserError
 from suite.runtime.signals import stop_signals
@@ -125,6 +126,7 @@ def plan(
     steps: int | None = None,
     out: Path = Path("runs"),
     wandb: str | None = None,
+    devices: Asked = None,
 ) -> list[Run]:
     """All runs of a sweep, each once, finished ones marked; nothing but the folder `out` is made.
 
@@ -134,12 +136,13 @@ def plan(
       seeds, preset, overrides, steps: as in `suite.registry.resolve`.
       out: the folder of all runs.
       wandb: the project at Weights & Biases that gets curves; None: it gets none.
+      devices: of each run, wherever it goes on; see `suite.runs.devices.chosen`.
 
     Raises:
       UserError: an unknown id, field or value in any of them, a folder that holds another run or cannot be written.
     """
     runs: dict[Path, Run] = {}
-    options = {"--steps": steps, "--wandb": wandb}
+    options = {"--steps": steps, "--wandb": wandb, "--devices": devices}
     more = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     agent_ids = _select("--agents", agents, registry.agents())
     with _device_memory_left_alone():

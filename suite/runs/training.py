@@ -16,14 +16,17 @@ import numpy as np
 from suite import registry
 from suite.agent.algorithm import first_programs, iterate, iteration_key, start_key
 from suite.agent.phases import Agent
-from suite.agent.state import TrainState
+from suite.agent.state import TrainState, laid_out
 from suite.configuration.schema import Config
 from suite.interface.environment import EnvironmentSpec
 from suite.records import checkpoint
 from suite.records.record import RunRecord, run_folder
 from suite.records.wandb_runs import WandbRun, require_wandb
+from suite.runs.devices import Asked, used
 from suite.runs.evaluation import episode_rows, record_evaluation
+from suite.runs.own_record import opened
 from suite.runs.saved_model import Remainder, SavedModel, agent_for
+from suite.runtime import layout, processes
 from suite.runtime.compilation import Ahead
 from suite.runtime.errors import RunError, UserError, host_errors, refusals_are_errors
 from suite.runtime.reporting import Reporter
@@ -79,6 +82,7 @@ def run(
     resume: bool = False,
     callbacks: Sequence[Callback] = (),
     wandb: str | None = None,
+    devices: Asked = None,
 ) -> Result:
     """Trains one agent on one task, or goes on where an earlier call of the same command stopped.
 
@@ -89,10 +93,12 @@ def run(
       resume: insist that there is a run to go on with.
       callbacks: called after each iteration; if one returns True, the run stops with a checkpoint.
       wandb: the project at Weights & Biases that gets curves, beside TensorBoard's; None: it gets none.
+      devices: between how many its batches are split, which may be others than when it was stopped; see
+        `suite.runs.devices.used`.
 
     Raises:
       UserError: before anything is compiled: the folder cannot be written, is in use, or holds another run; or Weights
-        & Biases cannot be used.
+        & Biases, or so many devices, cannot be used.
       RunError: the loss diverged or the disk is full; the last good checkpoint stays.
     """
     entry = registry.task(config.task)
@@ -101,15 +107,20 @@ def run(
         raise UserError(f"nothing to resume in {folder}: run without --resume to start there")
     if wandb is not None:
         require_wandb()
-    with refusals_are_errors(), RunRecord.open_or_create(folder, config, entry.spec()) as record:
+    with (
+        layout.over(used(config, devices, reporter)),
+        refusals_are_errors(),
+        processes.lost_ones(),
+        opened(folder, config, entry.spec()) as record,
+    ):
         if record.finished:
             _forget(record)  # a kill may have come before, or more was kept until now
-            return result_of(record, "already finished")
-        if wandb is not None:
+            return result_of(record, "already finished", folder)
+        if wandb is not None and processes.is_first():
             there = WandbRun(folder, config, wandb)
             record.draw_curves_at(there)
             reporter.message(f"Weights & Biases: {there.place}")
-        return _Training(config, agent_for(config, reporter), record, reporter, callbacks).run()
+        return _Training(config, agent_for(config, reporter), record, folder, reporter, callbacks).run()
 
 
 class IterationLog:
@@ -150,11 +161,17 @@ class _Training:
     """The host's side of a run: phases in order, their metrics and timing, checkpoints, signals, callbacks."""
 
     def __init__(
-        self, config: Config, agent: Agent, record: RunRecord, reporter: Reporter, callbacks: Sequence[Callback]
+        self,
+        config: Config,
+        agent: Agent,
+        record: RunRecord,
+        folder: Path,
+        reporter: Reporter,
+        callbacks: Sequence[Callback],
     ):
         self.config, self.agent, self.record, self.reporter = config, agent, record, reporter
         self.callbacks = callbacks
-        self.checkpoints = record.folder / "checkpoints"
+        self.checkpoints = folder / "checkpoints"
         self.iteration = self.steps = 0
         self.log = IterationLog(agent.spec, 0)  # of the present iteration
         self.unlocked: set[str] = set()  # achievements, in any episode so far
@@ -195,7 +212,7 @@ class _Training:
             self.ahead.close()
             self.reporter.stop()
             self.record.add_wall_clock(time.monotonic() - started, self.seconds)
-        return result_of(self.record, "finished" if self.record.finished else "stopped")
+        return result_of(self.record, "finished" if self.record.finished else "stopped", self.checkpoints.parent)
 
     def _passed(self, before: int, every: int) -> bool:
         """Whether the last iteration, begun at step `before`, reached another multiple of `every` (0: of nothing)."""
@@ -203,10 +220,11 @@ class _Training:
 
     def _restore(self) -> TrainState:
         key = start_key(self.config.seed)
-        template = jax.eval_shape(self.agent.init, key)
+        template = laid_out(jax.eval_shape(self.agent.init, key))
         remainder = Remainder.of(template).stored()
         try:
-            restored = checkpoint.restore_latest(self.checkpoints, SavedModel.of(template), remainder)
+            with layout.over([]):
+                restored = checkpoint.restore_latest(self.checkpoints, SavedModel.of(template), remainder)
         except UserError as error:
             raise UserError(f"{error}; choose another --out to start anew") from error
         if restored is None:
@@ -232,7 +250,7 @@ class _Training:
             self.ahead.begin(first_programs(self.agent, template))
         # A run that was killed at its end has dropped what only going on needs.
         resume = restored.resume or dict.fromkeys(remainder)
-        return Remainder(**resume).with_model(restored.model)
+        return laid_out(Remainder(**resume).with_model(restored.model))
 
     def _extend(self) -> None:
         """Gives a run that went back to its newest checkpoint the larger budget, if it is asked for."""
@@ -259,6 +277,7 @@ class _Training:
         for callback in self.callbacks:
             if callback(Iteration(self.steps, row, self.log.rows)):
                 self.stop_requested = True
+        self.stop_requested = any(processes.votes(self.stop_requested))
         return state
 
     def _call(self, phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -312,10 +331,14 @@ class _Training:
     def _save(self, state: TrainState) -> None:
         with self._phase("checkpoint"):
             host = {"iteration": self.iteration, "seconds": self.seconds}
-            model, remainder = SavedModel.of(state), Remainder.of(state).stored()
+            model, remainder = processes.whole((SavedModel.of(state), Remainder.of(state).stored()))
             self.record.require_own_folder()
             self.saving = True
-            checkpoint.save(self.checkpoints, self.steps, model, remainder, host, keep=self.config.checkpoint.keep)
+            if processes.is_first():
+                with layout.over([]):
+                    keep = self.config.checkpoint.keep
+                    checkpoint.save(self.checkpoints, self.steps, model, remainder, host, keep)
+            processes.votes(True)
             self.saving = False
         if self.stop_now:
             raise KeyboardInterrupt
@@ -352,11 +375,11 @@ def _forget(record: RunRecord) -> None:
     checkpoint.drop_resume(record.folder / "checkpoints", but_newest=more)
 
 
-def result_of(record: RunRecord, status: str) -> Result:
-    """What a run came to so far."""
+def result_of(record: RunRecord, status: str, folder: Path | None = None) -> Result:
+    """What a run came to so far. `folder` is where its record lasts, if this one is a copy."""
     score = registry.task(record.config.task).scores()
     scores = score(record.episodes(), record.config, record.spec)
     evaluations = record.table("evaluations")
     newest = evaluations[evaluations["step"] == evaluations["step"].max()]
     evaluation = score(newest, None, record.spec) if len(newest) else {}
-    return Result(record.folder, status, record.steps, record.wall_seconds, scores, evaluation)
+    return Result(folder or record.folder, status, record.steps, record.wall_seconds, scores, evaluation)

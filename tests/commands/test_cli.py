@@ -184,7 +184,7 @@ def fake_run(monkeypatch):
     """Replaces training; seed n scores n more. The calls so far, and what was put in place."""
     calls = []
 
-    def result(config, out, reporter, resume, callbacks, wandb, status="finished", scores=SCORES):
+    def result(config, out, reporter, resume, callbacks, wandb, devices, status="finished", scores=SCORES):
         calls.append((config, out, resume))
         scores = {name: value + config.seed for name, value in scores.items()}
         folder = run_folder(out, config)
