@@ -28,9 +28,9 @@ from suite.runtime.reporting import QuietReporter, Reporter
 PLAYED = ("reward_per_step", "episodes", "return")  # of metrics.csv: what play gave
 DREAMT = "imagine/"  # dreams are not replayed
 EXACT = 1e-5  # sums of float32 in another order
-# What was learned: rounding, which updates in float32 amplify, those of world models, of which there are hundreds, more
-# than those of policies; other settings differ by far more.
-LEARNED, MODELLED, NOTHING = 0.05, 0.15, 1e-3
+# What was learned: rounding, which tens and hundreds of updates in float32 amplify, of 300 runs by up to 8 % of a
+# metric; other settings differ by far more.
+LEARNED, NOTHING = 0.15, 1e-3
 # How many codes a VQ-VAE of whole frames uses after its first iteration is chance: of m1's first run parameters that
 # differ by 1e-7 of themselves give 33 instead of 12, and the world model's loss of these tokens is 1.9 instead of 1.3.
 CHAOTIC = 0.75
@@ -144,6 +144,5 @@ def _alike(name: str, recorded: float, value: float | None, chaotic: bool) -> bo
         return value is None and pd.isna(recorded)
     if name in PLAYED:
         return math.isclose(recorded, value, rel_tol=EXACT, abs_tol=EXACT)
-    modelled = name.startswith(("tokenizer/", "world_model/"))
-    tolerance = LEARNED if not modelled else CHAOTIC if chaotic else MODELLED
+    tolerance = CHAOTIC if chaotic and name.startswith(("tokenizer/", "world_model/")) else LEARNED
     return math.isclose(recorded, value, rel_tol=tolerance, abs_tol=NOTHING)
