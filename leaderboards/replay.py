@@ -28,8 +28,8 @@ from suite.runtime.reporting import QuietReporter, Reporter
 PLAYED = ("reward_per_step", "episodes", "return")  # of metrics.csv: what play gave
 DREAMT = "imagine/"  # dreams are not replayed
 EXACT = 1e-5  # sums of float32 in another order
-# What was learned: rounding, which tens and hundreds of updates in float32 amplify, of 300 runs by up to 8 % of a
-# metric; other settings differ by far more.
+# What was learned: rounding, which tens and hundreds of updates in float32 amplify, by up to 8 % of a metric in one run
+# of each row. A setting that changes less than this is not found.
 LEARNED, NOTHING = 0.15, 1e-3
 # How many codes a VQ-VAE of whole frames uses after its first iteration is chance: of m1's first run parameters that
 # differ by 1e-7 of themselves give 33 instead of 12, and the world model's loss of these tokens is 1.9 instead of 1.3.
