@@ -228,7 +228,8 @@ def _each(words: Iterable[str]) -> str:
 
 def _device(fields: DeviceFields) -> str:
     kind = f"{fields.cpu_cores} CPU cores" if fields.platform == "cpu" else fields.kind
-    return kind if fields.count == 1 else f"{fields.count} devices ({kind})"
+    devices = kind if fields.count == 1 else f"{fields.count} devices ({kind})"
+    return devices if fields.seeds == 1 else f"{devices}, {fields.seeds} seeds together"
 
 
 def _packages(fields: RecordFields) -> str:

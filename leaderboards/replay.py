@@ -21,8 +21,9 @@ from leaderboards.boards import Standing
 from suite.agent.algorithm import iterate, iteration_key, start_key
 from suite.configuration.schema import Config
 from suite.records.record import RunRecord
+from suite.runs.progress import IterationLog, told
 from suite.runs.saved_model import agent_for
-from suite.runs.training import PART_OF, IterationLog
+from suite.runs.training import PART_OF
 from suite.runtime.reporting import QuietReporter, Reporter
 
 PLAYED = ("reward_per_step", "episodes", "return")  # of metrics.csv: what play gave
@@ -99,7 +100,7 @@ def first_iteration(config: Config) -> IterationLog:
     def call(phase: str, function: Any, *arguments: Any) -> Any:
         result = function(*arguments)
         if phase not in PART_OF:
-            log.add(phase, result)
+            log.add(phase, *told(phase, result))
         return result
 
     # Dreams come last, cost most to compile, and are of what was learned before them.

@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from suite.api import Run, load, make, results, train
+    from suite.api import Run, load, make, results, train, train_together
 
-__all__ = ["Run", "load", "make", "results", "train"]
+__all__ = ["Run", "load", "make", "results", "train", "train_together"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""The suite from Python: `suite.make`, `suite.train`, `suite.load` and `suite.results`.
+"""The suite from Python: `suite.make`, `suite.train`, `suite.train_together`, `suite.load` and `suite.results`.
 
 Arrays are NumPy's and lead with B, whatever is side by side; what is given without that axis is answered without it.
 """
@@ -87,6 +87,46 @@ def train(
     config = registry.resolve(task, agent, preset, settings or (), seed, steps)
     result = training.run(config, Path(out), _reporter(progress), resume, tuple(callbacks), wandb, devices)
     return Run(RunRecord.open(result.folder, lock=False), result)
+
+
+def train_together(
+    task: str,
+    agent: str | None = None,
+    preset: str | None = None,
+    *,
+    seeds: Sequence[int],
+    steps: int | None = None,
+    settings: Mapping[str, Any] | Sequence[str] | None = None,
+    out: str | Path = "runs",
+    callbacks: Iterable[Callback] = (),
+    wandb: str | None = None,
+    devices: int | Literal["all"] | None = None,
+    progress: bool = False,
+) -> list[Run]:
+    """Trains several seeds as one program, or goes on with those that were stopped: `suite run --together`.
+
+    Each leaves the record that `train` leaves of it. One whose loss diverges does not stop the others: the status of
+    its result is "failed".
+
+    Args:
+      seeds: of one run each.
+      devices: of this process's, between which runs are divided; None: one CPU, or all accelerators.
+      task, agent, preset, steps, settings, out, callbacks, wandb, progress: as of `train`; a callback that returns True
+        stops all of them.
+
+    Returns:
+      the runs, in the order of `seeds`.
+
+    Raises:
+      UserError: as of `train`, or the task steps on the host.
+      RunError: none of them can go on.
+    """
+    _begin()
+    if not seeds:
+        raise UserError("seeds: there must be at least one")
+    configs = [registry.resolve(task, agent, preset, settings or (), seed, steps) for seed in dict.fromkeys(seeds)]
+    results = training.run_together(configs, Path(out), _reporter(progress), tuple(callbacks), wandb, devices)
+    return [Run(RunRecord.open(result.folder, lock=False), result) for result in results]
 
 
 def load(folder: str | Path) -> Run:

@@ -1,8 +1,8 @@
 """The agent (`Agent`): each phase of an iteration of Algorithm 1 as a compiled function.
 
 Each phase is one compiled function over donated state, with its loop inside; only metrics return to the host. The
-state is one pytree of arrays, so that several seeds can become its leading axis. `suite.agent.algorithm` runs
-the phases in their order.
+state is one pytree of arrays, so that several seeds can become its leading axis (`suite.agent.seeds`).
+`suite.agent.algorithm` runs the phases in their order.
 """
 
 from __future__ import annotations
@@ -20,10 +20,14 @@ from flax import nnx
 from suite.agent import rollout as play
 from suite.agent.dreams import Dreaming
 from suite.agent.replay import Eventful, ReplayState
+from suite.agent.seeds import split
 from suite.agent.state import TrainState, laid_out
+from suite.configuration.schema import Config
+from suite.interface.environment import Environment
 from suite.interface.tokens import TokenizerState, encode_frame
 from suite.interface.turns import stream_action
 from suite.policy import ppo
+from suite.runtime import layout
 from suite.tokenizers.nearest_neighbor import NearestNeighborState
 from suite.world_model import training as world_model_training
 from suite.world_model.history import History, ages_of
@@ -38,8 +42,9 @@ def _compiled(donate: int | tuple[()] = ()) -> Callable[[Callable[..., Any]], An
 
     def compiled(method: Callable[..., Any]) -> Any:
         @functools.wraps(method)
-        def phase(*arguments: Any) -> Any:
-            return laid_out(method(*arguments))
+        def phase(agent: Agent, *arguments: Any) -> Any:
+            of_one = functools.partial(method, agent)
+            return laid_out((layout.of_each_seed(of_one) if agent.seeds > 1 else of_one)(*arguments))
 
         return jax.jit(phase, static_argnums=0, donate_argnums=donate)
 
@@ -47,7 +52,15 @@ def _compiled(donate: int | tuple[()] = ()) -> Callable[[Callable[..., Any]], An
 
 
 class Agent(Dreaming):
-    """One agent on one task: its parts, how it dreams, and the compiled phases."""
+    """One agent on one task: its parts, how it dreams, and the compiled phases.
+
+    With several `seeds`, so many runs of it that go on together: all that phases take and return has a leading axis S.
+    """
+
+    def __init__(self, config: Config, environment: Environment, seeds: int = 1):
+        """As `Parts`; and how many runs go on together."""
+        super().__init__(config, environment)
+        self.seeds = seeds
 
     @property
     def metric_names(self) -> list[str]:
@@ -65,8 +78,12 @@ class Agent(Dreaming):
         return [f"{phase}/{metric}" for phase, metrics in phases.items() for metric in metrics]
 
     def init(self, key: jax.Array) -> TrainState:
-        """A fresh agent in fresh environments: two programs, since `start` is worth compiling only once."""
-        policy_key, rollout_key, tokenizer_key, model_key = jax.random.split(key, 4)
+        """A fresh agent in fresh environments: two programs, since `start` is worth compiling only once.
+
+        Args:
+          key: of its randomness; of several seeds one for each, [S].
+        """
+        policy_key, rollout_key, tokenizer_key, model_key = split(key, 4)
         untrained = self._untrained(policy_key, tokenizer_key, model_key)
         return TrainState(rollout=self.start(untrained["policy"].acting, rollout_key), **untrained)
 

@@ -39,8 +39,11 @@ class TrainState:
 def laid_out(tree: Tree) -> Tree:
     """The same arrays, or shapes of arrays, where `suite.runtime.layout` wants them.
 
-    Rollouts, trajectories and replayed steps are split along their batch axis. All else is on every device.
+    Rollouts, trajectories and replayed steps are split along their batch axis. All else is on every device. Of several
+    seeds, all is split along their axis.
     """
+    if layout.of_seeds():
+        return layout.split(tree)
     parts = (RolloutState, Recent, Trajectory, EpisodeLog, TrajectoryBufferState)
     return jax.tree.map(_laid_out, tree, is_leaf=lambda x: isinstance(x, parts))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +18,10 @@ from suite.commands.configuration import (
 )
 from suite.commands.printing import device_name, make_reporter, print_json, print_scores, score_line
 from suite.interface.scores import ScoreName
-from suite.runtime.errors import UserError
+from suite.runtime.errors import RunError, UserError
 
 if TYPE_CHECKING:
+    from suite.configuration.schema import Config
     from suite.runs.training import Result
 
 SUMMARY = "train an agent on a task, or go on where the same command stopped"
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     seeds = parser.add_mutually_exclusive_group()
     seeds.add_argument("--seed", type=int, default=0, metavar="N", help="of all randomness (default 0)")
     seeds.add_argument("--seeds", type=parse_seeds, metavar="N-M", help="several, one after another: 0-2 or 0,3,5")
+    parser.add_argument("--together", action="store_true", help="all seeds at once, as one program: --seeds 0-7")
     parser.add_argument("--out", type=Path, default=Path("runs"), metavar="DIR", help="where records go (default runs)")
     add_devices(parser)
     add_wandb(parser)
@@ -41,12 +43,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
+    seeds = args.seeds or [args.seed]
+    if args.together and (len(seeds) < 2 or args.coordinator):
+        raise UserError("--together is for several seeds in one process: add --seeds 0-3, without --coordinator")
     join_processes(args)
 
     from suite import registry
     from suite.records.record import RunRecord, require_writable, run_folder
 
-    seeds = args.seeds or [args.seed]
     configs = [registry.resolve(args.task, args.agent, args.preset, args.overrides, seed, args.steps) for seed in seeds]
     folders = [run_folder(args.out, config) for config in configs]
     begun = [(folder / "record.json").exists() for folder in folders]
@@ -54,39 +58,23 @@ def execute(args: argparse.Namespace) -> int:
         raise UserError(f"nothing to resume in {folders[0]}: run without --resume to start there")
     require_wandb_of(args)
 
-    from suite.runs.devices import used
+    from suite.runs.devices import used, used_together
 
-    devices = len(used(configs[0], args.devices, make_reporter(args.quiet)))
+    reporter = make_reporter(args.quiet)
+    if args.together:
+        devices = len(used_together(configs[0], len(seeds), args.devices, reporter))
+    else:
+        devices = len(used(configs[0], args.devices, reporter))
     require_writable(args.out)
     for folder, config, exists in zip(folders, configs, begun, strict=True):
         if exists:  # so that the last seed's folder is known to be right before the first one's run starts
             RunRecord.open(folder, config, lock=False)
 
-    from suite import api
-
     results: list[Result] = []
-    for folder, config, exists in zip(folders, configs, begun, strict=True):
-        if not args.quiet:
-            what = f"{config.task}, agent {config.agent}, preset {config.preset}, seed {config.seed}"
-            print(f"{what}, on {device_name(devices)}; files in {folder}", flush=True)
-        result = api.train(
-            args.task,
-            args.agent,
-            args.preset,
-            seed=config.seed,
-            steps=args.steps,
-            settings=args.overrides,
-            out=args.out,
-            resume=args.resume and exists,
-            wandb=args.wandb,
-            devices=args.devices,
-            progress=not args.quiet,
-        ).result
+    for result in _trained(args, configs, begun, devices):
         results.append(result)
         _print_result(result)
-        if result.status == "stopped":
-            break
-    finished = [result for result in results if result.status != "stopped"]
+    finished = [result for result in results if "finished" in result.status]
     summary = _summary(finished)
     if len(finished) > 1:
         print(f"{len(finished)} seeds, mean +- standard error:")
@@ -94,8 +82,7 @@ def execute(args: argparse.Namespace) -> int:
             print(score_line(name, mean, error))
     if args.json:
         runs = [_result_fields(config.seed, result) for config, result in zip(configs, results, strict=False)]
-        config = configs[0]
-        fields: dict[str, Any] = {"task": config.task, "agent": config.agent, "preset": config.preset}
+        fields: dict[str, Any] = {name: getattr(configs[0], name) for name in ("task", "agent", "preset")}
         if len(seeds) == 1:
             fields |= runs[0]
         else:
@@ -103,7 +90,39 @@ def execute(args: argparse.Namespace) -> int:
             fields["mean"] = {name: mean for name, (mean, _) in summary.items()}
             fields["standard_error"] = {name: error for name, (_, error) in summary.items()}
         print_json(fields)
-    return STOPPED if len(finished) < len(results) else 0
+    statuses = {result.status for result in results}
+    return RunError.exit_code if "failed" in statuses else STOPPED if "stopped" in statuses else 0
+
+
+def _trained(
+    args: argparse.Namespace, configs: Sequence[Config], begun: Sequence[bool], devices: int
+) -> Iterator[Result]:
+    """Trains one seed after another, until one is stopped, or all of them together."""
+    from suite import api
+    from suite.records.record import run_folder
+
+    common = {"steps": args.steps, "settings": args.overrides, "out": args.out, "wandb": args.wandb}
+    common |= {"devices": args.devices, "progress": not args.quiet}
+    config = configs[0]
+    what = f"{config.task}, agent {config.agent}, preset {config.preset}"
+    where = f"on {device_name(devices)}; files in"
+    if args.together:
+        if not args.quiet:
+            seeds = ", ".join(str(config.seed) for config in configs)
+            folder = run_folder(args.out, config).parent
+            print(f"{what}, seeds {seeds} together, {where} {folder}", flush=True)
+        chosen = [config.seed for config in configs]
+        for run in api.train_together(args.task, args.agent, args.preset, seeds=chosen, **common):
+            yield run.result
+        return
+    for config, exists in zip(configs, begun, strict=True):
+        if not args.quiet:
+            print(f"{what}, seed {config.seed}, {where} {run_folder(args.out, config)}", flush=True)
+        resume = args.resume and exists
+        result = api.train(args.task, args.agent, args.preset, seed=config.seed, resume=resume, **common).result
+        yield result
+        if result.status == "stopped":
+            return
 
 
 def _print_result(result: Result) -> None:
@@ -111,6 +130,8 @@ def _print_result(result: Result) -> None:
         print(f"stopped at step {result.steps:,}; the same command goes on from there")
     elif result.status == "already finished":
         print("already finished: nothing was run")
+    elif result.status == "failed":
+        print(f"failed: {result.reason}")
     print_scores(result.scores)
     if result.evaluation and not result.scores["episodes"]:
         print(f"its newest evaluation, of {result.evaluation['episodes']} whole episodes:")
@@ -119,7 +140,7 @@ def _print_result(result: Result) -> None:
 
 
 def _result_fields(seed: int, result: Result) -> dict[str, Any]:
-    return {
+    fields = {
         "seed": seed,
         "status": result.status,
         "steps": result.steps,
@@ -127,6 +148,7 @@ def _result_fields(seed: int, result: Result) -> dict[str, Any]:
         "folder": str(result.folder),
         "scores": result.scores,
     }
+    return fields | ({"reason": result.reason} if result.reason else {})
 
 
 def _summary(results: Sequence[Result]) -> dict[str, tuple[float, float]]:

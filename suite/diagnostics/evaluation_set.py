@@ -212,7 +212,8 @@ def collect(agent: Agent, pairs: int, reporter: Reporter) -> tuple[EvaluationSet
     reporter.start(config.total_steps, 0)
     for iteration in range(iterations):
         key = iteration_key(config.seed, iteration)
-        state, taken = iterate(agent, state, key, taken, functools.partial(keep, iteration))
+        state, after = iterate(agent, state, key, taken, functools.partial(keep, iteration))
+        taken = int(after)
         reporter.update(taken, "collect", {})
     reporter.stop()
     return EvaluationSet(**_joined(np.stack, kept)), Pairs(**_joined(np.concatenate, pairs_kept))

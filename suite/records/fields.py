@@ -53,6 +53,7 @@ class DeviceFields(_Part):
     kind: str
     cpu_cores: PositiveInt | None
     count: PositiveInt = 1  # of devices; records of earlier versions, which had one, do not say
+    seeds: PositiveInt = 1  # that went on together there; likewise
 
 
 class RecordFields(_Part):

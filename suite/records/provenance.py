@@ -13,8 +13,8 @@ from typing import Any
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "flashbax", "numpy", "world-model-suite")
 
 
-def provenance() -> dict[str, Any]:
-    """Versions, commit and devices, as they stand in record.json."""
+def provenance(seeds: int = 1) -> dict[str, Any]:
+    """Versions, commit and devices, as they stand in record.json; `seeds`: how many runs go on together."""
     import jax
 
     from suite.runtime import layout
@@ -29,6 +29,7 @@ def provenance() -> dict[str, Any]:
             "kind": device.device_kind,
             "cpu_cores": os.cpu_count(),
             "count": layout.devices(),
+            "seeds": seeds,
         },
     }
 

@@ -114,6 +114,7 @@ class RunRecord:
         self._events: Curves | None = None  # TensorBoard's
         self._purge_step: int | None = None
         self._new = self._all_counted = False
+        self._company = 1
 
     @classmethod
     def create(cls, folder: Path, config: Config, spec: EnvironmentSpec) -> RunRecord:
@@ -224,6 +225,12 @@ class RunRecord:
         """The task's specification."""
         return self._spec or registry.task(self.config.task).spec()
 
+    def note_company(self, seeds: int) -> None:
+        """So many runs, this one among them, go on together; before it goes on."""
+        self._company = seeds
+        if self._new:
+            self.update(device=provenance(seeds)["device"])
+
     def append_episodes(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Adds training episodes, in the order in which they ended.
 
@@ -300,7 +307,7 @@ class RunRecord:
         self._begin_tables()
         if not self._new:  # a run that has only just begun is not resumed
             self._purge_step = step + 1
-            resumed = {"step": step, "date": _now(), **provenance()}
+            resumed = {"step": step, "date": _now(), **provenance(self._company)}
             self.update(steps=step, resumed=[*self.fields.resumed, resumed])
         return moved
 

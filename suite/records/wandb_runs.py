@@ -51,6 +51,7 @@ class WandbRun:
                 project=project,
                 id=_id(folder / "wandb"),
                 resume="allow",
+                reinit="create_new",  # of several that go on together each has its own
                 name=f"{group}/{seed}",
                 group=group,
                 config=config.as_dict(),

@@ -35,11 +35,18 @@ def chosen(config: Config, asked: Asked) -> int:
         asked = visible
     if asked is None:
         return 1 if kind == "cpu" else next(n for n in range(visible, 0, -1) if n == 1 or not any(_misfits(config, n)))
+    number = _visible(asked)
+    require_equal_shares(config, number)
+    return number
+
+
+def _visible(asked: int | Literal["all"]) -> int:
+    """So many devices, if there are so many."""
+    kind, visible = device_kind(), jax.device_count()
     number = visible if asked == "all" else asked
     if not 1 <= number <= visible:
-        more = "; XLA_FLAGS=--xla_force_host_platform_device_count=N splits a CPU, for tests" if kind == "cpu" else ""
+        more = "; XLA_FLAGS=--xla_force_host_platform_device_count=N splits a CPU" if kind == "cpu" else ""
         raise UserError(f"--devices {asked}: JAX sees {visible} of kind {kind}{more}")
-    require_equal_shares(config, number)
     return number
 
 
@@ -56,6 +63,27 @@ def used(config: Config, asked: Asked, reporter: Reporter) -> list[jax.Device]:
             raise UserError(f"{config.task} steps on the host, which feeds one device of one process: --devices 1")
         number = 1
     return jax.devices()[:number]
+
+
+def used_together(config: Config, seeds: int, asked: Asked, reporter: Reporter) -> list[jax.Device]:
+    """The devices between which so many runs, that differ by their seed, are divided: no more than there are runs.
+
+    Raises:
+      UserError: there are not so many devices, there are several processes, or the task steps on the host.
+    """
+    if processes.number() > 1:
+        raise UserError("--together is for one process: leave --coordinator away")
+    if asked is None:
+        asked = 1 if device_kind() == "cpu" else "all"
+    number = min(_visible(asked), seeds)
+    if isinstance(agent_for(config, reporter, computed(seeds, number)).batched.environment, HostEnvironment):
+        raise UserError(f"{config.task} steps on the host, where runs take turns: leave --together away")
+    return jax.devices()[:number]
+
+
+def computed(seeds: int, devices: int) -> int:
+    """How many runs are computed so that each device has as many: some of them for nothing."""
+    return -(-seeds // devices) * devices
 
 
 def require_equal_shares(config: Config, devices: int) -> None:

@@ -131,7 +131,7 @@ def evaluate_policy(task: str, reference: str, episodes: int | None, reporter: R
     enable_compilation_cache()
     contest = Contest(policy, Batched(entry.make()(progress=reporter.texture), NUM_ENVS))
     count = episodes or (GAMES if spec.two_player else NUM_ENVS)
-    rows = play_episodes(contest, None, jax.random.key(0), count)
+    [rows] = play_episodes(contest, None, [jax.random.key(0)], count)
     return {"episodes": len(rows), **entry.scores()(rows, None, spec)}
 
 

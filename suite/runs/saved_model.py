@@ -138,12 +138,13 @@ def no_checkpoint(record: RunRecord) -> UserError:
     return UserError(f"{record.folder} has no checkpoint; run it first: suite run {record.config.task}")
 
 
-_agents: dict[Config, Agent] = {}  # the last one built
+_agents: dict[tuple[Config, int], Agent] = {}  # the last one built
 
 
-def agent_for(config: Config, reporter: Reporter) -> Agent:
-    """The agent of a configuration. Those that differ by seed, by a budget that nothing is tied to, or in when runs are
-    evaluated and saved share one.
+def agent_for(config: Config, reporter: Reporter, seeds: int = 1) -> Agent:
+    """The agent of a configuration, as so many runs that go on together (`suite.agent.seeds`).
+
+    Those that differ by seed, by a budget that nothing is tied to, or in when runs are evaluated and saved share one.
 
     With it they share its compiled programs. Those of the agent before are dropped: they would stay for good, and on a
     CPU each agent's are thousands of memory maps, of which Linux gives a process 65,530. XLA crashes where they end.
@@ -152,11 +153,11 @@ def agent_for(config: Config, reporter: Reporter) -> Agent:
     shared = dataclasses.replace(
         config, seed=0, protocol=protocol, evaluation=EvaluationConfig(), checkpoint=CheckpointConfig()
     )
-    if shared not in _agents:
+    if (shared, seeds) not in _agents:
         _agents.clear()
         jax.clear_caches()
         device_kind()  # or one line that says that there is none
         enable_compilation_cache()
         environment = registry.task(config.task).make()(progress=reporter.texture)
-        _agents[shared] = Agent(shared, environment)
-    return _agents[shared]
+        _agents[shared, seeds] = Agent(shared, environment, seeds)
+    return _agents[shared, seeds]

@@ -1,31 +1,31 @@
-"""One run, start to finish: build, resume, train, evaluate, record."""
+"""Runs, start to finish: build, resume, train, evaluate, record. One, or several seeds of one that go on together."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 from suite import registry
-from suite.agent.algorithm import first_programs, iterate, iteration_key, start_key
+from suite.agent.algorithm import evaluation_key, first_programs, iterate, iteration_key, start_key
 from suite.agent.phases import Agent
+from suite.agent.seeds import part, stacked, unstacked
 from suite.agent.state import TrainState, laid_out
 from suite.configuration.schema import Config
-from suite.interface.environment import EnvironmentSpec
 from suite.records import checkpoint
 from suite.records.record import RunRecord, run_folder
 from suite.records.wandb_runs import WandbRun, require_wandb
-from suite.runs.devices import Asked, used
-from suite.runs.evaluation import episode_rows, record_evaluation
+from suite.runs.devices import Asked, computed, used, used_together
+from suite.runs.evaluation import play_episodes
 from suite.runs.own_record import opened
-from suite.runs.saved_model import Remainder, SavedModel, agent_for
+from suite.runs.progress import Iteration, Progress, forget, told
+from suite.runs.saved_model import Remainder, agent_for
 from suite.runtime import layout, processes
 from suite.runtime.compilation import Ahead
 from suite.runtime.errors import RunError, UserError, host_errors, refusals_are_errors
@@ -33,7 +33,8 @@ from suite.runtime.reporting import Reporter
 from suite.runtime.signals import stop_signals
 
 PART_OF = {"remember": "collect", "code": "tokenizer"}  # phases without metrics, which are not timed by themselves
-PHASES = ("start", "collect", "learn", "tokenizer", "world_model", "imagine", "checkpoint")
+
+Tree = TypeVar("Tree")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,11 +43,13 @@ class Result:
 
     Attributes:
       folder: where its record is.
-      status: "finished", "stopped" (by a signal or a callback) or "already finished".
+      status: "finished", "stopped" (by a signal or a callback), "already finished", or, of one among others that went
+        on together, "failed".
       steps: real steps taken.
       wall_seconds: of all its processes.
       scores: by name, from its training episodes.
       evaluation: by name, from the episodes of its newest evaluation; empty if there was none.
+      reason: why it failed.
     """
 
     folder: Path
@@ -55,21 +58,7 @@ class Result:
     wall_seconds: float
     scores: dict[str, float]
     evaluation: dict[str, float] = dataclasses.field(default_factory=dict)
-
-
-@dataclasses.dataclass(frozen=True)
-class Iteration:
-    """What one iteration of Algorithm 1 left in the record.
-
-    Attributes:
-      step: real steps taken by then.
-      metrics: its row of `metrics.csv`, by column.
-      episodes: the rows of `episodes.csv` of the episodes that ended in it, by column.
-    """
-
-    step: int
-    metrics: dict[str, Any]
-    episodes: list[dict[str, Any]]
+    reason: str = ""
 
 
 Callback = Callable[[Iteration], bool | None]
@@ -101,184 +90,188 @@ def run(
         & Biases, or so many devices, cannot be used.
       RunError: the loss diverged or the disk is full; the last good checkpoint stays.
     """
-    entry = registry.task(config.task)
     folder = run_folder(out, config)
     if resume and not (folder / "record.json").exists():
         raise UserError(f"nothing to resume in {folder}: run without --resume to start there")
     if wandb is not None:
         require_wandb()
-    with (
-        layout.over(used(config, devices, reporter)),
-        refusals_are_errors(),
-        processes.lost_ones(),
-        opened(folder, config, entry.spec()) as record,
-    ):
-        if record.finished:
-            _forget(record)  # a kill may have come before, or more was kept until now
-            return result_of(record, "already finished", folder)
-        if wandb is not None and processes.is_first():
-            there = WandbRun(folder, config, wandb)
-            record.draw_curves_at(there)
-            reporter.message(f"Weights & Biases: {there.place}")
-        return _Training(config, agent_for(config, reporter), record, folder, reporter, callbacks).run()
+    with layout.over(used(config, devices, reporter)):
+        [result] = _run([config], [folder], reporter, callbacks, wandb)
+    return result
 
 
-class IterationLog:
-    """What the phases of one iteration gave.
+def run_together(
+    configs: Sequence[Config],
+    out: Path,
+    reporter: Reporter,
+    callbacks: Sequence[Callback] = (),
+    wandb: str | None = None,
+    devices: Asked = None,
+) -> list[Result]:
+    """Trains several runs that differ by their seed as one program, or goes on with those of them that were stopped.
 
-    Attributes:
-      steps: real steps taken by its end.
-      rows: of the episodes that ended in it, as in `episodes.csv`.
-      metrics: by name, as in `metrics.csv`.
+    Each has the record that it has if it is run alone. One that fails does not stop the others.
+
+    Args:
+      configs: the resolved configurations.
+      out, reporter, callbacks, wandb: as of `run`; a callback that returns True stops all of them.
+      devices: between how many the runs are divided, each of which is on one; None: one CPU, or all accelerators.
+
+    Returns:
+      what they came to, in the same order.
+
+    Raises:
+      UserError, RunError: as of `run`; and a UserError for a task that steps on the host.
     """
+    if wandb is not None:
+        require_wandb()
+    spec = registry.task(configs[0].task).spec()
+    folders = [run_folder(out, config) for config in configs]
+    going = [
+        config
+        for config, folder in zip(configs, folders, strict=True)
+        if not (folder / "record.json").exists() or not RunRecord.open(folder, config, spec, lock=False).finished
+    ]
+    chosen = used_together(configs[0], max(1, len(going)), devices, reporter)
+    # One that is left alone is a run like any other.
+    with layout.over(chosen, layout.SEEDS):
+        return _run(configs, folders, reporter, callbacks, wandb)
 
-    def __init__(self, spec: EnvironmentSpec, steps: int):
-        self.spec, self.steps = spec, steps
-        self.rows: list[dict[str, Any]] = []
-        self.metrics: dict[str, Any] = {}
 
-    def add(self, phase: str, result: Any) -> dict[str, float]:
-        """Takes what a phase returned; its metrics, on the host, prefixed by the phase."""
-        if phase == "collect":
-            _, trajectory, log = result
-            log = jax.device_get(log)
-            self.rows, taken = episode_rows(log, self.spec, log.ended_TB, self.steps)
-            self.steps += taken
-            self.metrics["reward_per_step"] = float(trajectory.reward_TB.mean())
-            return {}
-        values = {f"{phase}/{name}": float(value) for name, value in jax.device_get(result[1]).items()}
-        self.metrics |= values
-        return values
+def _run(
+    configs: Sequence[Config],
+    folders: Sequence[Path],
+    reporter: Reporter,
+    callbacks: Sequence[Callback],
+    wandb: str | None,
+) -> list[Result]:
+    spec = registry.task(configs[0].task).spec()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(refusals_are_errors())
+        stack.enter_context(processes.lost_ones())
+        opening = zip(folders, configs, strict=True)
+        records = [stack.enter_context(opened(folder, config, spec)) for folder, config in opening]
+        going: dict[int, Progress] = {}
+        for i, record in enumerate(records):
+            if record.finished:
+                forget(record)  # a kill may have come before, or more was kept until now
+            else:
+                going[i] = Progress(record, spec)
+        for progress in going.values():
+            progress.record.note_company(len(going))
+            if wandb is not None and processes.is_first():
+                there = WandbRun(progress.record.folder, progress.config, wandb)
+                progress.record.draw_curves_at(there)
+                reporter.message(f"Weights & Biases: {there.place}")
+        if going:
+            _Training(list(going.values()), reporter, callbacks).run()
+        return [
+            result_of(record, _status(going.get(i)), folder, going[i].reason if i in going else "")
+            for i, (record, folder) in enumerate(zip(records, folders, strict=True))
+        ]
 
-    def row(self) -> dict[str, Any]:
-        """The iteration's row of `metrics.csv`."""
-        returns = [row["return"] for row in self.rows]
-        first = {"reward_per_step": self.metrics["reward_per_step"], "episodes": len(returns)}
-        return {"step": self.steps, **first, "return": float(np.mean(returns)) if returns else None} | self.metrics
+
+def _status(progress: Progress | None) -> str:
+    if progress is None:
+        return "already finished"
+    return "failed" if progress.reason else "finished" if progress.record.finished else "stopped"
 
 
 class _Training:
-    """The host's side of a run: phases in order, their metrics and timing, checkpoints, signals, callbacks."""
+    """The host's side of runs that go on together: phases in order, timing, checkpoints, signals, callbacks."""
 
-    def __init__(
-        self,
-        config: Config,
-        agent: Agent,
-        record: RunRecord,
-        folder: Path,
-        reporter: Reporter,
-        callbacks: Sequence[Callback],
-    ):
-        self.config, self.agent, self.record, self.reporter = config, agent, record, reporter
-        self.callbacks = callbacks
-        self.checkpoints = folder / "checkpoints"
-        self.iteration = self.steps = 0
-        self.log = IterationLog(agent.spec, 0)  # of the present iteration
-        self.unlocked: set[str] = set()  # achievements, in any episode so far
-        self.seconds: dict[str, float] = {}  # wall-clock per phase, over all of the run's processes
-        self.recorded_seconds: dict[str, float] = {}  # of those, what timing.csv has
+    def __init__(self, runs: Sequence[Progress], reporter: Reporter, callbacks: Sequence[Callback]):
+        self.runs, self.reporter, self.callbacks = runs, reporter, callbacks
+        # The first run stands for those that are missing so that devices have equal shares.
+        self.seeds = 1 if len(runs) == 1 else computed(len(runs), layout.devices())
+        self.agent: Agent = agent_for(runs[0].config, reporter, self.seeds)
         self.stop_requested = self.stop_now = self.saving = False
         self.ahead = Ahead()
 
     @property
-    def done(self) -> bool:
-        """No whole iteration fits the budget any more."""
-        return self.steps + self.config.steps_per_iteration > self.config.protocol.steps
+    def going(self) -> list[Progress]:
+        """Those that are not at their end."""
+        return [run for run in self.runs if not run.ended]
 
-    def run(self) -> Result:
-        started = time.monotonic()
-        self.reporter.start(self.config.protocol.steps, 0)
+    def run(self) -> None:
+        total = sum(run.config.protocol.steps for run in self.runs)
+        self.reporter.start(total, 0)
+        status: str | None = None
         try:
             with self._phase("start"):
                 state = self._restore()
-            self.reporter.start(self.config.protocol.steps, self.steps)
+            self.reporter.start(total, self._steps())
             with stop_signals(self._heard), host_errors():
-                while not self.done and not self.stop_requested:
-                    before = self.steps
+                self._finish(state)
+                while self.going and not self.stop_requested:
                     state = self._iterate(state)
                     # Before the checkpoint: what is evaluated after it would be missing if the run died in between.
-                    if self._passed(before, self.config.evaluation.every_steps):
-                        self._evaluate(state)
-                    if self._passed(before, self.config.checkpoint.every_steps) or self.stop_requested:
-                        self._save(state)
-                if self.done:
+                    self._evaluate(state, [run for run in self.going if run.passed(run.config.evaluation.every_steps)])
+                    self._save(
+                        state,
+                        [
+                            run
+                            for run in self.going
+                            if run.passed(run.config.checkpoint.every_steps) or self.stop_requested
+                        ],
+                    )
                     self._finish(state)
-                else:
-                    self.record.update(status="stopped")
+            status = "stopped"
         except RunError:
-            self.record.update(status="failed")
+            status = "failed"
             raise
         finally:
             self.ahead.close()
             self.reporter.stop()
-            self.record.add_wall_clock(time.monotonic() - started, self.seconds)
-        return result_of(self.record, "finished" if self.record.finished else "stopped", self.checkpoints.parent)
+            for run in self.runs:
+                run.leave(status)
 
-    def _passed(self, before: int, every: int) -> bool:
-        """Whether the last iteration, begun at step `before`, reached another multiple of `every` (0: of nothing)."""
-        return _passes(before, self.steps, every)
+    def _steps(self) -> int:
+        return sum(run.steps for run in self.runs)
+
+    def _together(self, parts: Sequence[Tree]) -> Tree:
+        """What each run has, as the agent takes it."""
+        return stacked([*parts, *[parts[0]] * (self.seeds - len(parts))])
 
     def _restore(self) -> TrainState:
-        key = start_key(self.config.seed)
-        template = laid_out(jax.eval_shape(self.agent.init, key))
-        remainder = Remainder.of(template).stored()
-        try:
-            with layout.over([]):
-                restored = checkpoint.restore_latest(self.checkpoints, SavedModel.of(template), remainder)
-        except UserError as error:
-            raise UserError(f"{error}; choose another --out to start anew") from error
-        if restored is None:
-            self.record.rewind(0)
-            self._extend()
+        keys = self._together([start_key(run.config.seed) for run in self.runs])
+        template = laid_out(jax.eval_shape(self.agent.init, keys))
+        of_one = template
+        if self.seeds > 1:
+            of_one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), template)
+        saved = [run.restore(of_one, self.reporter) for run in self.runs]
+        if not all(run.done for run in self.runs):
             self.ahead.begin(first_programs(self.agent, template))
-            return self.agent.init(key)
-        for warning in restored.warnings:
-            self.reporter.warning(warning)
-        self.iteration, self.steps = restored.host["iteration"], restored.host["steps"]
-        self.seconds = restored.host["seconds"]
-        self.recorded_seconds = dict(self.seconds)
-        if restored.resume is None and not self.done:
-            raise UserError(
-                f"{self.checkpoints} holds only the model of step {self.steps:,}, which cannot be trained on"
-            )
-        self.record.rewind(self.steps)
-        self._extend()
-        achievements = self.record.episodes()[list(self.agent.spec.achievements)]
-        self.unlocked.update(achievements.columns[achievements.any()])
-        self.reporter.message(f"resuming at step {self.steps:,}")
-        if not self.done:
-            self.ahead.begin(first_programs(self.agent, template))
-        # A run that was killed at its end has dropped what only going on needs.
-        resume = restored.resume or dict.fromkeys(remainder)
-        return laid_out(Remainder(**resume).with_model(restored.model))
-
-    def _extend(self) -> None:
-        """Gives a run that went back to its newest checkpoint the larger budget, if it is asked for."""
-        if self.record.asks_for_more:
-            every = self.config.evaluation.every_steps
-            ends = itertools.pairwise([0, *self.record.table("metrics")["step"]])
-            self.record.extend({end for before, end in ends if _passes(before, end, every)})
+        if not any(saved):
+            return self.agent.init(keys)
+        # What a run has not saved is that of its start; of one that is at its end it does not matter.
+        missing = len(self.runs) > 1 and not all(each and each[1] for each in saved)
+        starts = unstacked(self.agent.init(keys), self.seeds) if missing else [None] * self.seeds
+        return laid_out(self._together([_joined(*pair) for pair in zip(saved, starts, strict=False)]))
 
     def _iterate(self, state: TrainState) -> TrainState:
-        """One iteration of Algorithm 1, and what it leaves in the record."""
-        self.log = IterationLog(self.agent.spec, self.steps)
-        key = iteration_key(self.config.seed, self.iteration)
-        self.iteration += 1
-        state, _ = iterate(self.agent, state, key, self.steps, self._call)
-        self.record.append_episodes(self.log.rows)
-        row = self.log.row()
-        self.record.append_metrics(row, self.agent.metric_names)
-        self._record_timing()
-        self.unlocked.update(name for name in self.agent.spec.achievements if any(row[name] for row in self.log.rows))
-        shown = {} if row["return"] is None else {"return": row["return"]}
-        if self.agent.spec.achievements:
-            shown["achievements"] = len(self.unlocked)
-        self.reporter.update(self.steps, "", shown)
+        """One iteration of Algorithm 1, and what it leaves in the records."""
+        for run in self.going:
+            run.begin_iteration()
+        keys = self._together([iteration_key(run.config.seed, run.iteration - 1) for run in self.runs])
+        steps = self._together([np.array(run.steps) for run in self.runs])
+        state, _ = iterate(self.agent, state, keys, np.asarray(steps), self._call)
+        left = [run.end_iteration(self.agent.metric_names) for run in self.going]
+        self._show(left)
         for callback in self.callbacks:
-            if callback(Iteration(self.steps, row, self.log.rows)):
-                self.stop_requested = True
+            for iteration in left:
+                if callback(iteration):
+                    self.stop_requested = True
         self.stop_requested = any(processes.votes(self.stop_requested))
         return state
+
+    def _show(self, left: Sequence[Iteration]) -> None:
+        shown: dict[str, float] = {}
+        if returns := [iteration.metrics["return"] for iteration in left if iteration.metrics["return"] is not None]:
+            shown["return"] = float(np.mean(returns))
+        if self.agent.spec.achievements:
+            shown["achievements"] = float(np.mean([len(run.unlocked) for run in self.runs]))
+        self.reporter.update(self._steps(), "", shown)
 
     def _call(self, phase: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Runs and times a phase; keeps its metrics and, of real play, the episodes."""
@@ -289,19 +282,25 @@ class _Training:
         with self._phase(phase):
             self.ahead.wait(phase)
             result = function(*arguments)
-            self._check(phase, self.log.add(phase, result))
-            self.steps = self.log.steps
+            parts = told(phase, result, self.seeds)
+            dreams_S = np.atleast_1d(arguments[-2]) > 0 if phase == "imagine" else np.ones(self.seeds, bool)
+            for run, own, learns in zip(self.runs, parts, dreams_S, strict=False):
+                if learns and not run.ended:
+                    self._take(run, phase, own)
         return result
 
-    def _record_timing(self) -> None:
-        """Seconds per phase since the last iteration's row; the first compiles."""
-        since = {name: self.seconds.get(name, 0.0) - self.recorded_seconds.get(name, 0.0) for name in PHASES}
-        self.record.append_timing({"step": self.steps, **since})
-        self.recorded_seconds = dict(self.seconds)
+    def _take(self, run: Progress, phase: str, own: Any) -> None:
+        try:
+            run.take(phase, own)
+        except RunError as error:
+            if len(self.runs) == 1:
+                raise
+            run.fail(str(error))
+            self.reporter.warning(f"seed {run.config.seed} ends here, the others go on: {error}")
 
     @contextlib.contextmanager
     def _phase(self, name: str) -> Iterator[None]:
-        self.reporter.update(self.steps, name, {})
+        self.reporter.update(self._steps(), name, {})
         with self._timed(name):
             yield
 
@@ -309,47 +308,39 @@ class _Training:
     def _timed(self, name: str) -> Iterator[None]:
         start = time.monotonic()
         yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
+        for run in self.going:
+            run.spent(name, time.monotonic() - start)
 
-    def _check(self, phase: str, values: dict[str, float]) -> None:
-        """Stops the run where a loss or gradient is not finite."""
-        for name, value in values.items():
-            if not np.isfinite(value):
-                kept = checkpoint.latest_step(self.checkpoints)
-                where = "no checkpoint was saved yet" if kept is None else f"the checkpoint at step {kept:,} is kept"
-                raise RunError(f"{name} became {value} in phase {phase} at step {self.steps:,}; {where}")
-
-    def _evaluate(self, state: TrainState) -> None:
-        """Plays whole episodes with the present policy, unless there are enough of this step already."""
-        episodes = self.config.evaluation.episodes
-        if self.record.has_evaluation(self.steps, episodes):
+    def _evaluate(self, state: TrainState, runs: Sequence[Progress]) -> None:
+        """Plays whole episodes with the present policies of these, unless there are enough already."""
+        lacking = [run for run in runs if run.lacks_evaluation()]
+        if not lacking:
             return
         with self._phase("evaluate"):
-            self.record.rewind_evaluations(self.steps)
-            record_evaluation(self.record, self.agent, state.policy.acting, self.steps, episodes)
+            keys = [evaluation_key(run.config.seed, run.steps) if run in lacking else None for run in self.runs]
+            keys += [None] * (self.seeds - len(keys))
+            played = play_episodes(self.agent, state.policy.acting, keys, runs[0].config.evaluation.episodes)
+            for run, rows in zip(self.runs, played, strict=False):
+                if run in lacking:
+                    run.record.append_evaluation({**row, "step": run.steps} for row in rows)
 
-    def _save(self, state: TrainState) -> None:
-        with self._phase("checkpoint"):
-            host = {"iteration": self.iteration, "seconds": self.seconds}
-            model, remainder = processes.whole((SavedModel.of(state), Remainder.of(state).stored()))
-            self.record.require_own_folder()
-            self.saving = True
-            if processes.is_first():
-                with layout.over([]):
-                    keep = self.config.checkpoint.keep
-                    checkpoint.save(self.checkpoints, self.steps, model, remainder, host, keep)
-            processes.votes(True)
-            self.saving = False
-        if self.stop_now:
-            raise KeyboardInterrupt
+    def _save(self, state: TrainState, runs: Sequence[Progress]) -> None:
+        for run in runs:
+            with self._phase("checkpoint"):
+                own = part(state, self.seeds, self.runs.index(run))
+                self.saving = True
+                run.save(own)
+                self.saving = False
+            if self.stop_now:
+                raise KeyboardInterrupt
 
     def _finish(self, state: TrainState) -> None:
-        """Saves the last checkpoint, plays the final evaluation, and closes the record."""
-        if checkpoint.latest_step(self.checkpoints) != self.steps:
-            self._save(state)
-        self._evaluate(state)
-        _forget(self.record)
-        self.record.finish(self.steps)  # last: what is finished goes on only if it is given more steps
+        """Saves the last checkpoints of runs at their end, plays the final evaluation, and closes the records."""
+        done = [run for run in self.going if run.done]
+        self._save(state, [run for run in done if checkpoint.latest_step(run.checkpoints) != run.steps])
+        self._evaluate(state, done)
+        for run in done:
+            run.finish()
 
     def _heard(self, count: int) -> None:
         """The first signal ends the run after this iteration, with a checkpoint; the second at once.
@@ -363,23 +354,23 @@ class _Training:
         self.reporter.message("stopping after this iteration, with a checkpoint (again: stop now)")
 
 
-def _passes(before: int, steps: int, every: int) -> bool:
-    """Whether there is a multiple of `every` after `before` and up to `steps`."""
-    return bool(every) and steps // every > before // every
+def _joined(saved: Any, start: TrainState | None) -> TrainState:
+    """The state of a run from what it has saved, if it has, and of the rest from its `start`, if that is given."""
+    if saved is None:
+        assert start is not None
+        return start
+    model, remainder = saved
+    if remainder is None:
+        nothing: dict[str, Any] = dict.fromkeys(field.name for field in dataclasses.fields(Remainder))
+        remainder = Remainder(**nothing) if start is None else Remainder.of(start)
+    return remainder.with_model(model)
 
 
-def _forget(record: RunRecord) -> None:
-    """Deletes what a finished run needs no longer."""
-    config = record.config
-    more = config.checkpoint.keep_resume and not config.tied_to_budget
-    checkpoint.drop_resume(record.folder / "checkpoints", but_newest=more)
-
-
-def result_of(record: RunRecord, status: str, folder: Path | None = None) -> Result:
+def result_of(record: RunRecord, status: str, folder: Path | None = None, reason: str = "") -> Result:
     """What a run came to so far. `folder` is where its record lasts, if this one is a copy."""
     score = registry.task(record.config.task).scores()
     scores = score(record.episodes(), record.config, record.spec)
     evaluations = record.table("evaluations")
     newest = evaluations[evaluations["step"] == evaluations["step"].max()]
     evaluation = score(newest, None, record.spec) if len(newest) else {}
-    return Result(folder or record.folder, status, record.steps, record.wall_seconds, scores, evaluation)
+    return Result(folder or record.folder, status, record.steps, record.wall_seconds, scores, evaluation, reason)

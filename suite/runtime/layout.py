@@ -7,6 +7,9 @@ same function of its own rows.
 
 All of this is decided by the mesh that `over` sets. Without one, on one device, the functions here return what they are
 given: the programs are those of one device.
+
+Several runs that differ by their seed may also be one program, `of_each_seed`: all that they carry has one more axis,
+the first, and that one is split between the devices instead.
 """
 
 from __future__ import annotations
@@ -21,15 +24,19 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 AXIS = "data"
+SEEDS = "seeds"  # the axis of a mesh whose devices have whole runs, instead of rows of one
 
 Tree = TypeVar("Tree")
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 @contextlib.contextmanager
-def over(devices: Sequence[jax.Device]) -> Iterator[None]:
-    """Splits the batches of what is traced and called inside, in this thread, between these devices, if several."""
-    with same(Mesh(devices, (AXIS,), axis_types=(AxisType.Auto,)) if len(devices) > 1 else None):
+def over(devices: Sequence[jax.Device], axis: str = AXIS) -> Iterator[None]:
+    """Splits what is traced and called inside, in this thread, between these devices, if several.
+
+    `axis`: what is split: batches, or `SEEDS`.
+    """
+    with same(Mesh(devices, (axis,), axis_types=(AxisType.Auto,)) if len(devices) > 1 else None):
         yield
 
 
@@ -50,9 +57,41 @@ def same(mesh: Mesh | None) -> Iterator[None]:
 
 
 def devices() -> int:
-    """Between how many devices batches are split here: 1 on one device, and inside of what `per_device` calls."""
+    """Between how many devices arrays are split here: 1 on one device, and inside of what is called on each of them."""
     found = jax.sharding.get_abstract_mesh()
     return 1 if found.empty or found.manual_axes else found.size
+
+
+def of_seeds() -> bool:
+    """Whether devices have whole runs, so that everything is split along its first axis."""
+    return SEEDS in jax.sharding.get_abstract_mesh().axis_names
+
+
+def takes_turns() -> bool:
+    """Whether a device computes one run after another, rather than all of its share at once."""
+    return jax.default_backend() == "cpu"
+
+
+def of_each_seed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of arrays with one more axis, the first, that of seeds: what it returns for each seed's arrays alone.
+
+    Each device takes an equal share of seeds. On a CPU it takes one after the other, and gives what `function` itself
+    gives to the last bit. XLA's batched programs are slower there, by 1.7 times for `mfrl` (docs/performance.md), and
+    round otherwise. An accelerator takes its share at once, since that fills it.
+    """
+
+    def own(*arguments: Any) -> Any:
+        if len(jax.tree.leaves(arguments)[0]) == 1:
+            alone = function(*jax.tree.map(lambda x: x[0], arguments))
+            return jax.tree.map(lambda x: x[None], alone)
+        if takes_turns():
+            return jax.lax.map(lambda each: function(*each), arguments)
+        return jax.vmap(function)(*arguments)
+
+    if devices() == 1:
+        return own
+    spec = PartitionSpec(SEEDS)
+    return jax.shard_map(own, in_specs=spec, out_specs=spec, check_vma=False)
 
 
 def split(tree: Tree, axis: int = 0) -> Tree:
@@ -116,11 +155,11 @@ def _shared(taken_BT: jax.Array, has_B: jax.Array) -> jax.Array:
 
 def _inside() -> bool:
     """Whether this is inside of what `per_device` calls on several devices."""
-    return bool(jax.sharding.get_abstract_mesh().manual_axes)
+    return AXIS in jax.sharding.get_abstract_mesh().manual_axes
 
 
 def _spec(axis: int | None) -> PartitionSpec:
-    return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, AXIS)
+    return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, SEEDS if of_seeds() else AXIS)
 
 
 def _put(tree: Tree, spec: PartitionSpec) -> Tree:

@@ -28,11 +28,15 @@ SIZES = {
 }
 CERTAIN_DREAMS = {"imagination.trust": 0, "imagination.trust_window": 0}  # m6 dreams however little it knows
 STEPS = 384  # two iterations of 16 x 12
+SHARED = 2
 WHERE = {"one": (1, 1), "all, then one": (DEVICES, 1), "one, then all": (1, DEVICES)}  # the first iteration, the others
 
 
 def train(out: Path, task: str, agent: str) -> dict[str, Any]:
-    """Folders of the same run, by `WHERE` its iterations were; and what programs of many devices `moved`, by phase."""
+    """Folders of the same run, by `WHERE` its iterations were; and what programs of many devices `moved`, by phase.
+
+    And folders of it and of two others that went on `together`, on `SHARED` devices.
+    """
     from suite import api
     from suite.runs import training
     from suite.runtime import layout
@@ -42,7 +46,7 @@ def train(out: Path, task: str, agent: str) -> dict[str, Any]:
 
     class Watched(training.Ahead):
         def close(self) -> None:
-            if layout.devices() > 1:
+            if layout.devices() == DEVICES:
                 moved.update({name: transfers(program.result()) for name, program in self._compiled.items()})
             super().close()
 
@@ -69,7 +73,9 @@ def train(out: Path, task: str, agent: str) -> dict[str, Any]:
         folders[name] = part(name, others, stop=False)
     if (imagine := dreams(task, agent, settings)) is not None:
         moved["imagine"] = transfers(imagine)
-    return {"folders": folders, "moved": moved}
+    options: dict[str, Any] = {"steps": STEPS, "settings": settings, "out": out / "together", "devices": SHARED}
+    together = api.train_together(task, agent, "smoke", seeds=range(SHARED + 1), **options)
+    return {"folders": folders, "moved": moved, "together": [str(run.folder) for run in together]}
 
 
 def dreams(task: str, agent_id: str, settings: dict[str, Any]) -> Any:

@@ -21,7 +21,7 @@ from suite.runs.devices import chosen, used
 from suite.runtime import layout
 from suite.runtime.errors import UserError
 from suite.runtime.reporting import QuietReporter
-from tests.runs.on_devices import SIZES, WHERE
+from tests.runs.on_devices import SHARED, SIZES, WHERE
 
 TASKS, AGENTS = ("craftax_classic", "minatar/breakout", "openspiel/leduc"), ("mfrl", "m1", "m5", "m6")
 LONG = (pytest.mark.devices, pytest.mark.timeout(3600))
@@ -60,6 +60,18 @@ def test_the_record_is_that_of_one_device(trained, where):
     first = expected["step"].iloc[0]
     expected, found = (table(trained, name, "episodes").query(f"step <= {first}") for name in ("one", where))
     pd.testing.assert_frame_equal(found, expected)
+
+
+def test_seeds_on_devices_of_their_own_leave_the_record_of_one_alone(trained):
+    """Three on two devices, so that one of them is computed twice."""
+    assert len(trained["together"]) == SHARED + 1
+    for name in ("metrics", "episodes"):
+        expected, found = table(trained, "one", name), pd.read_csv(f"{trained['together'][0]}/{name}.csv")
+        pd.testing.assert_frame_equal(found, expected, rtol=1e-4, atol=1e-6)
+    others = [(Path(folder) / "metrics.csv").read_bytes() for folder in trained["together"]]
+    assert len(set(others)) == len(others)
+    devices = [json.loads((Path(folder) / "record.json").read_text())["device"] for folder in trained["together"]]
+    assert {(device["count"], device["seeds"]) for device in devices} == {(SHARED, SHARED + 1)}
 
 
 def test_a_record_says_on_how_many_devices(trained):

@@ -24,7 +24,7 @@ from suite.records import checkpoint
 from suite.records import record as record_module
 from suite.records.record import RunRecord
 from suite.records.tables import CsvTable
-from suite.runs import evaluation, training
+from suite.runs import evaluation, progress, training
 from suite.runs.saved_model import restore
 from suite.runtime.errors import RunError, UserError
 from suite.runtime.reporting import QuietReporter, RichReporter
@@ -453,14 +453,14 @@ def test_achievements_are_counted_while_it_runs(tmp_path, monkeypatch):
             if fields:
                 shown.append((steps, fields["achievements"]))
 
-    class NoneMore(training.IterationLog):
-        def add(self, phase, result):
-            values = super().add(phase, result)
+    class NoneMore(progress.IterationLog):
+        def add(self, phase, part):
+            values = super().add(phase, part)
             self.rows = [row | {"arrive": 0} for row in self.rows]
             return values
 
     training.run(config("random"), tmp_path, Watcher(), callbacks=[lambda iteration: iteration.step == 96])
-    monkeypatch.setattr(training, "IterationLog", NoneMore)
+    monkeypatch.setattr(progress, "IterationLog", NoneMore)
     episodes = training.run(config("random"), tmp_path, Watcher()).folder / "episodes.csv"
     first = pd.read_csv(episodes).query("arrive == 1")["step"].min()
     assert first <= 96 and shown == [(step, int(step >= first)) for step in (32, 64, 96, 128, 160, 192)]
