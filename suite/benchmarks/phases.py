@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from suite import registry
 from suite.agent.algorithm import iterate, iteration_key, start_key
 from suite.agent.phases import Agent
+from suite.benchmarks.collectives import share_in_collectives
 from suite.benchmarks.comparisons import (
     Rows,
     compare_attention,
@@ -38,7 +39,8 @@ def bench(config: Config, reporter: Reporter, start_up: bool = True, devices: in
       config: what to measure.
       reporter: where progress goes.
       start_up: also start the same command twice in new processes, with an empty and a filled cache.
-      devices: between how many the phases' batches are split; then it says how fast they are on one, too.
+      devices: between how many the phases' batches are split; then it also says how fast they are on one, and which
+        share of the time of all devices their exchanges take.
 
     Returns:
       tables and numbers by title, for printing.
@@ -114,6 +116,7 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
             return holder[0]
 
         seconds = seconds_of(call)
+        row = {} if layout.devices() == 1 else {"collectives %": 100 * share_in_collectives(call, layout.devices())}
         kind = (config.world_model if phase in ("tokenizer", "world_model") else config.policy).compute_type
         rows.append(
             {
@@ -122,6 +125,7 @@ def phase_table(agent: Agent, config: Config, peak: dict[str, float], reporter: 
                 "share %": 0.0,
                 "GFLOP/s": flops / seconds / 1e9,
                 "% of matmul": 100 * flops / seconds / (peak[kind] * layout.devices()),
+                **row,
             }
         )
         return holder[0]

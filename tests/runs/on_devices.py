@@ -149,6 +149,22 @@ def counted_flops() -> list[int]:
         return [count_flops(jnp.dot, left, right), count_flops(product, left, right)]
 
 
+def collective_shares() -> list[float]:
+    """Of the time of a program that adds up what all devices have, and of one that does not."""
+    import jax
+    import jax.numpy as jnp
+
+    from suite.benchmarks.collectives import share_in_collectives
+    from suite.runtime import layout
+
+    with layout.over(jax.devices()):
+        rows = layout.split(jnp.ones((64 * DEVICES, 128)))
+        programs = [jax.jit(lambda x: layout.replicated(x.sum(0))), jax.jit(lambda x: layout.split(x * 2))]
+        for program in programs:
+            jax.block_until_ready(program(rows))
+        return [share_in_collectives(lambda: program(rows), DEVICES) for program in programs]  # noqa: B023 -- at once
+
+
 def main(folder: str, task: str, agent: str) -> None:
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={DEVICES}"
 
@@ -158,7 +174,7 @@ def main(folder: str, task: str, agent: str) -> None:
     registry.TASKS = (*registry.TASKS, CORRIDOR, PENNIES)
     result = train(Path(folder), task, agent)
     if task == CORRIDOR.id:
-        result |= {"kernel_difference": kernel_difference(), "flops": counted_flops()}
+        result |= {"kernel_difference": kernel_difference(), "flops": counted_flops(), "shares": collective_shares()}
     print(json.dumps(result))
 
 

@@ -111,6 +111,8 @@ def test_a_kernel_of_ours_computes_the_same_and_all_devices_work_is_counted(trai
         pytest.skip("only of the smallest case")
     assert trained["kernel_difference"] < 1e-5
     assert trained["flops"] == [2 * 8 * 3 * 5] * 2
+    adds, does_not = trained["shares"]
+    assert 0 < adds < 1 and does_not == 0
 
 
 @pytest.fixture
