@@ -17,10 +17,12 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
+from leaderboards.results import run_folders
 from suite import registry
 from suite.runtime.errors import UserError
 
 FOLDER, STEPS, SUMMARY, FILMSTRIP = "inspect", "steps.csv", "summary.csv", "filmstrip.png"
+EPISODES = "episodes_sha256"
 FILES = (STEPS, SUMMARY, "codes.csv", FILMSTRIP)
 FILMSTRIP_BYTES = 30_000  # at most: whoever opens the page loads it
 ERROR, SYMBOLS = "error", "symbols_percent"  # measures of a rollout's frames
@@ -35,11 +37,13 @@ class InspectedRun:
       name: the run's in its table: "m5", or "m5 seed 0".
       trained: real steps until its checkpoint.
       steps: a row for each step of the rollouts, which is the index.
+      episodes: SHA-256 of the run's episodes.csv.
     """
 
     name: str
     trained: int
     steps: pd.DataFrame
+    episodes: str
 
     @property
     def agent(self) -> str:
@@ -118,17 +122,33 @@ def inspections_in(out: Path) -> list[Inspection]:
     return found
 
 
+def require_published(inspections: Sequence[Inspection], folders: Sequence[Path]) -> None:
+    """Raises a UserError if one is of another run than any in or below these folders of the same agent."""
+    if not inspections:
+        return
+    runs = {(folder / "episodes.csv"): folder.parts for folder in run_folders(folders)}
+    digests = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in runs if path.is_file()}
+    for inspection in inspections:
+        for run in inspection.runs:
+            if not any(digest == run.episodes and run.agent in runs[path] for path, digest in digests.items()):
+                raise UserError(
+                    f"{inspection.folder / SUMMARY}: {run.name} is none of the published runs of {run.agent}, by "
+                    "their episodes.csv: inspect those"
+                )
+
+
 def _inspection(folder: Path, task: str, files: dict[str, bytes]) -> Inspection:
     registry.task(task)
     steps = _table(folder / STEPS, ("run", "step", ERROR, BOUNDS[0]))
-    trained = _table(folder / SUMMARY, ("run", "checkpoint")).set_index("run")["checkpoint"]
+    summary = _table(folder / SUMMARY, ("run", "checkpoint"), (EPISODES,)).set_index("run")
+    trained = summary["checkpoint"]
     if set(trained.index) != set(steps["run"]) or trained.index.has_duplicates:
         raise UserError(f"{folder / STEPS} and {folder / SUMMARY} are not of the same runs: copy both from one folder")
     runs = []
     for name, rows in steps.groupby("run", sort=False):
         if rows["step"].tolist() != list(range(1, len(rows) + 1)):
             raise UserError(f"{folder / STEPS} has not each step of {name} once, from 1 on: suite inspect writes it so")
-        runs.append(InspectedRun(str(name), int(trained[name]), rows.set_index("step")))
+        runs.append(InspectedRun(str(name), int(trained[name]), rows.set_index("step"), summary[EPISODES][name]))
     digest = hashlib.sha256(b"".join(hashlib.sha256(content).digest() for content in files.values()))
     filmstrip = _filmstrip(folder / FILMSTRIP, files[FILMSTRIP]) if FILMSTRIP in files else None
     return Inspection(folder, task, tuple(runs), filmstrip, digest.hexdigest())
@@ -145,14 +165,14 @@ def _filmstrip(path: Path, content: bytes) -> Filmstrip:
     return Filmstrip(content, image.size, str(image.info.get("Description", "")))
 
 
-def _table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
-    """A CSV file of runs; of the columns that are shown, all but the first are numbers."""
+def _table(path: Path, columns: Sequence[str], words: Sequence[str] = ()) -> pd.DataFrame:
+    """A CSV file of runs; of the columns that are shown, all but the first are numbers, and `words` are none."""
     try:
-        table = pd.read_csv(path, dtype={"run": str})
+        table = pd.read_csv(path, dtype={"run": str, **dict.fromkeys(words, str)})
     except (OSError, ValueError) as error:  # among them what pandas finds wrong with it
         reason = error.strerror if isinstance(error, OSError) else str(error).splitlines()[0]
         raise UserError(f"cannot read {path} ({reason}): suite inspect writes it") from error
-    if missing := [name for name in columns if name not in table]:
+    if missing := [name for name in (*columns, *words) if name not in table]:
         raise UserError(f"{path} has no column {', '.join(missing)}: suite inspect writes it")
     numbers = table[[name for name in (*columns[1:], SYMBOLS, *BOUNDS) if name in table]]
     named = table["run"].notna() & (table["run"].str.strip() != "")

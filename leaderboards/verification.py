@@ -7,7 +7,7 @@ import io
 from pathlib import Path
 
 from leaderboards.boards import as_csv, boards
-from leaderboards.inspections import FILES, inspections_in, is_inspection
+from leaderboards.inspections import FILES, inspections_in, is_inspection, require_published
 from leaderboards.publish import PAGE, evidence_in
 from leaderboards.published import PATH
 from leaderboards.qualification import EVIDENCE
@@ -30,6 +30,7 @@ def verify(out: Path) -> list[str]:
         problems += (f"{name}: {problem}" for problem in _differences(out / name, as_csv(board)))
     try:
         inspections = inspections_in(out)
+        require_published(inspections, [out / "evidence"])
     except UserError as error:
         problems.append(str(error))
     else:

@@ -25,25 +25,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(args: argparse.Namespace) -> int:
-    from leaderboards.inspections import inspections_in
+    from leaderboards.inspections import inspections_in, require_published
     from leaderboards.publish import publish
 
     if args.page is not None and args.page.exists() and not args.page.is_dir():
         raise UserError(f"--page {args.page} is no folder")
     inspections = inspections_in(args.out)
+    runs = args.runs or ([RUNS] if RUNS.is_dir() else [])
+    require_published(inspections, [args.out / "evidence", *runs])
     if args.plot is not None:
         from leaderboards.page.world_models import require_picture, write_picture
 
         require_picture(args.plot, inspections)
-    publication = publish(args.runs or ([RUNS] if RUNS.is_dir() else []), args.out)
+    publication = publish(runs, args.out)
     for refusal in publication.refusals:
         print(f"refused {refusal}", file=sys.stderr)
     if not publication.entries:
         raise UserError(f"nothing to publish: none of {len(publication.refusals)} runs qualifies")
     entries = publication.entries
-    runs = sum(len(entry.records) for entry in entries)
+    count = sum(len(entry.records) for entry in entries)
     print(f"{len(publication.added)} runs added, {len(publication.refusals)} refused; ", end="")
-    print(f"{runs} runs in {len(entries)} entries")
+    print(f"{count} runs in {len(entries)} entries")
     print(f"{len(publication.tables)} tables in {args.out}")
     page = None
     if args.page is not None:

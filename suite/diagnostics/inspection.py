@@ -78,7 +78,12 @@ def inspect(folders: Sequence[Path], out: Path | None, reporter: Reporter) -> di
             picture = pictures.code_picture(run.agent.tokenizer, tokenizer, used, spec.observation.shape, high)
             pictures.save(out / f"codes-{name.replace(' ', '-').replace('/', '-')}.png", picture)
 
-    _write_table(out / "summary.csv", {name: pd.DataFrame([row]) for name, row in rows.items()})
+    # So that leaderboards can tell whether it is of the runs that they publish.
+    digests = [record.episodes_digest() for record in records]
+    summaries = [
+        pd.DataFrame([row | {"episodes_sha256": digest}]) for row, digest in zip(rows.values(), digests, strict=True)
+    ]
+    _write_table(out / "summary.csv", dict(zip(rows, summaries, strict=True)))
     _write_table(out / "steps.csv", steps)
     if codes:
         _write_table(out / "codes.csv", codes)

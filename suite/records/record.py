@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import hashlib
 import os
 import tempfile
 from collections.abc import Collection, Iterable, Mapping
@@ -382,6 +383,10 @@ class RunRecord:
             self._counted(self.steps, episodes)
             self._all_counted = True  # what is finished does not change
         return episodes
+
+    def episodes_digest(self) -> str:
+        """SHA-256 of episodes.csv, which tells runs apart."""
+        return hashlib.sha256((self.folder / "episodes.csv").read_bytes()).hexdigest()
 
     def table(self, name: str) -> pd.DataFrame:
         """One of the CSV files, by its name without the ending; of a run that is not finished, the rows so far.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from pathlib import Path
 from xml.etree import ElementTree
@@ -22,8 +23,8 @@ TASK = "minatar/breakout"
 REPOSITORY = Path(__file__).parents[2]
 
 
-def write_inspection(out, runs, folder="", task=TASK, steps=5, bound=98.0, trained=102_400, symbols=True):
-    """What `suite inspect` writes of runs: by name, what each loses in every step."""
+def write_inspection(out, runs, folder="", task=TASK, steps=5, bound=98.0, trained=102_400, symbols=True, of=None):
+    """What `suite inspect` writes of runs: by name, what each loses in every step. `of`: a run's folder; None: none."""
     folder = Path(out, "evidence", task, "inspect", folder)
     folder.mkdir(parents=True)
     tables = []
@@ -35,7 +36,9 @@ def write_inspection(out, runs, folder="", task=TASK, steps=5, bound=98.0, train
             table |= {"real_symbols_percent": 99.5 + 0.0 * step}
         tables.append(pd.DataFrame(table))
     pd.concat(tables).to_csv(folder / "steps.csv", index=False)
-    pd.DataFrame({"run": list(runs), "checkpoint": trained}).to_csv(folder / "summary.csv", index=False)
+    digest = "of no run" if of is None else hashlib.sha256((of / "episodes.csv").read_bytes()).hexdigest()
+    summary = pd.DataFrame({"run": list(runs), "checkpoint": trained, "episodes_sha256": digest})
+    summary.to_csv(folder / "summary.csv", index=False)
     real = np.random.default_rng(0).integers(0, 2, (steps + 1, 10, 10, 4), np.uint8)
     strip = filmstrips.Strip("Trajectory 3.", real, dict.fromkeys(list(runs)[:1], real[1:]), [], (1, 1), 1)
     (folder / "filmstrip.png").write_bytes(filmstrips.small_filmstrip(strip))
@@ -101,8 +104,12 @@ FAULTS = {
     "text": (lambda f: spoil(f, "steps.csv", b"99.5", b"high"), "steps.csv has no rows, or some without"),
     "infinity": (lambda f: spoil(f, "steps.csv", b"99.5", b"inf"), "steps.csv has no rows, or some without"),
     "no number": (lambda f: spoil(f, "summary.csv", b"102400", b""), "summary.csv has no rows, or some without"),
+    "no digest": (lambda f: spoil(f, "summary.csv", b"episodes", b"e"), "summary.csv has no column episodes_sha256"),
     "no run": (lambda f: spoil(f, "steps.csv", b"m5", b" "), "steps.csv has no rows, or some without"),
-    "no rows": (lambda f: (f / "summary.csv").write_text("run,checkpoint\n"), "summary.csv has no rows, or some"),
+    "no rows": (
+        lambda f: (f / "summary.csv").write_text("run,checkpoint,episodes_sha256\n"),
+        "summary.csv has no rows, or some",
+    ),
     "a step": (lambda f: spoil(f, "steps.csv", b"m5,3", b"m5,2"), "has not each step of m5 once, from 1 on"),
     "another run": (lambda f: spoil(f, "summary.csv", b"m5", b"m6"), "are not of the same runs"),
     "no picture": (lambda f: (f / "filmstrip.png").write_text("GIF"), "filmstrip.png is no whole PNG"),
@@ -145,8 +152,7 @@ def test_a_change_in_any_file_changes_the_page(tmp_path):
 
 
 def test_verify_knows_what_the_page_shows_of_world_models(suite):
-    write()
-    folder = write_inspection("leaderboards", {"m5 seed 0": 1.0}, "m5")
+    folder = write_inspection("leaderboards", {"m5 seed 0": 1.0}, "m5", of=write("m5"))
     (folder / "codes.csv").write_text("run,step,codes\nm5 seed 0,1,2\n")
     assert suite("publish", "--page", "leaderboards", "--plot", "w.svg")[0] == 0
     assert suite("verify", "leaderboards")[0] == 0
@@ -171,6 +177,23 @@ def test_verify_knows_what_the_page_shows_of_world_models(suite):
     assert Path("leaderboards/minatar_breakout.csv").read_bytes() == before
 
 
+def test_it_must_be_of_runs_that_are_published(suite):
+    """Not of one that has been replaced since, nor of another agent's."""
+    first = write("m5", out="first")
+    folder = write_inspection("leaderboards", {"m5 seed 0": 1.0}, of=first)
+    assert suite("publish", "first", "--page", "leaderboards")[0] == 0
+    spoil(folder, "summary.csv", b"m5", b"m6")
+    spoil(folder, "steps.csv", b"m5", b"m6")
+    code, out, _ = suite("verify", "leaderboards")
+    assert code == 1 and "summary.csv: m6 seed 0 is none of the published runs of m6" in out
+    shutil.rmtree("leaderboards")
+    write_inspection("leaderboards", {"m5 seed 0": 1.0}, of=first)
+    write("m5", out="second", returns=(2.0, 5.0))
+    code, _, error = suite("publish", "second")
+    assert code == 2 and "m5 seed 0 is none of the published runs of m5" in error
+    assert not list(Path("leaderboards").glob("*.csv"))
+
+
 def test_a_picture_of_its_own(suite):
     write()
     for words, message in (
@@ -179,8 +202,8 @@ def test_a_picture_of_its_own(suite):
     ):
         assert suite("publish", "--plot", *words)[::2] == (2, f"error: {message}\n")
     assert not Path("leaderboards").exists()
-    write_inspection("leaderboards", {"m5": 1.0})
-    write_inspection("leaderboards", {"m6": 1.0}, "m6", bound=97.0)
+    write_inspection("leaderboards", {"m5": 1.0}, of=write("m5"))
+    write_inspection("leaderboards", {"m6": 1.0}, "m6", bound=97.0, of=write("m6"))
     assert "plot w.svg\n" in suite("publish", "--plot", "w.svg")[1]
     root = ElementTree.parse("w.svg").getroot()
     texts = [element.text for element in root.iter("{http://www.w3.org/2000/svg}text")]
