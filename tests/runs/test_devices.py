@@ -24,42 +24,40 @@ from suite.runtime.reporting import QuietReporter
 from tests.runs.on_devices import SHARED, SIZES, WHERE
 
 TASKS, AGENTS = ("craftax_classic", "minatar/breakout", "openspiel/leduc"), ("mfrl", "m1", "m5", "m6")
-NARROW = ("craftax_classic", "m1")
 LONG = (pytest.mark.devices, pytest.mark.timeout(3600))
+SHORT = ("corridor", "m6")
 CASES = [
-    ("corridor", "m6"),
+    SHORT,
     *(pytest.param(case, marks=LONG) for case in itertools.product(TASKS, AGENTS)),
 ]
 
 
 @pytest.fixture(scope="module", params=CASES, ids=lambda case: "-".join(case))
 def trained(request, tmp_path_factory):
-    """What `tests.runs.on_devices` printed of a task and an agent."""
+    """What `tests.runs.on_devices` printed of a task and an agent, whose programs all but the short case compile fully.
+
+    Half compiled, sums round more differently, and frames and tokens of a VQ-VAE, which are whole numbers, differ by 1.
+    """
     words = [str(tmp_path_factory.mktemp("devices")), *request.param]
     strict = {"JAX_NUMPY_DTYPE_PROMOTION": "strict", "JAX_NUMPY_RANK_PROMOTION": "raise"}  # as in all tests
+    fully = {} if request.param == SHORT else {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0", "XLA_FLAGS": ""}
     done = subprocess.run(
         [sys.executable, "-m", "tests.runs.on_devices", *words],
         capture_output=True,
         text=True,
-        env=os.environ | strict,
+        env=os.environ | strict | fully,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(done.stdout.splitlines()[-1]) | {"case": request.param}
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def table(trained, where, name):
     return pd.read_csv(f"{trained['folders'][where]}/{name}.csv")
 
 
-def assert_alike(found, expected, trained):
-    """The same metrics but for rounding; what is near 0 is a difference of numbers that are not.
-
-    In dreams of m1 on Craftax-classic returns are nearly all the same, and the policy learns from how they differ: what
-    they are rounded by shows in the third digit.
-    """
-    dreams = [name for name in expected if name.startswith("imagine/")] if trained["case"] == NARROW else []
-    pd.testing.assert_frame_equal(found.drop(columns=dreams), expected.drop(columns=dreams), rtol=1e-4, atol=1e-6)
-    pd.testing.assert_frame_equal(found[dreams], expected[dreams], rtol=1e-2, atol=1e-3)
+def assert_alike(found, expected):
+    """The same metrics but for rounding; what is near 0 is a difference of numbers that are not."""
+    pd.testing.assert_frame_equal(found, expected, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("where", [name for name in WHERE if name != "one"])
@@ -67,7 +65,7 @@ def test_the_record_is_that_of_one_device(trained, where):
     """Stopped on all devices and gone on with on one, and the other way round."""
     expected, found = (table(trained, name, "metrics") for name in ("one", where))
     assert len(expected) == 2
-    assert_alike(found, expected, trained)
+    assert_alike(found, expected)
     first = expected["step"].iloc[0]
     expected, found = (table(trained, name, "episodes").query(f"step <= {first}") for name in ("one", where))
     pd.testing.assert_frame_equal(found, expected)
@@ -77,7 +75,7 @@ def test_seeds_on_devices_of_their_own_leave_the_record_of_one_alone(trained):
     """Three on two devices, so that one of them is computed twice."""
     assert len(trained["together"]) == SHARED + 1
     expected, found = table(trained, "one", "metrics"), pd.read_csv(f"{trained['together'][0]}/metrics.csv")
-    assert_alike(found, expected, trained)
+    assert_alike(found, expected)
     first = expected["step"].iloc[0]
     expected, found = table(trained, "one", "episodes"), pd.read_csv(f"{trained['together'][0]}/episodes.csv")
     pd.testing.assert_frame_equal(found.query(f"step <= {first}"), expected.query(f"step <= {first}"))
