@@ -19,6 +19,7 @@ from suite.runtime.errors import UserError
 if TYPE_CHECKING:
     from rich.console import Console, Group
 
+    from suite.runs.places import Environment
     from suite.runs.sweep import Handle, Run
 
 SUMMARY = "tasks x agents x seeds, side by side; the same command again does what is missing"
@@ -40,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--jobs",
         type=whole(1),
         metavar="N",
-        help="runs at once (default: 1 for two CPU cores; 1 on a GPU; Ray: what fits)",
+        help="runs at once (default: 1 for two CPU cores; 1 for each GPU; Ray: what fits)",
     )
     parser.add_argument("--engine", choices=("local", "ray"), default="local", help="this machine (default), or Ray")
     parser.add_argument("--address", metavar="A", help="Ray's (default: RAY_ADDRESS, or Ray is started here)")
@@ -80,11 +81,11 @@ def execute(args: argparse.Namespace) -> int:
     )
     _require_devices(runs, args.devices, on_ray)
     if any(run.status == "waiting" for run in runs):
-        with _engine(args) as (start, jobs, where):
+        with _engine(args, runs) as (start, places, where):
             if not args.quiet:
                 print(f"{_plan_line(runs)}; {where}; records in {out}", flush=True)
             with _display(args.quiet) as show, contextlib.redirect_stdout(_RayNews()):
-                sweep.sweep(runs, start, jobs, show)
+                sweep.sweep(runs, start, places, show)
     _print_results(runs)
     if args.json:
         print_json({"runs": [_fields(run) for run in runs]})
@@ -114,21 +115,24 @@ def _require_ray() -> None:
 
 
 @contextlib.contextmanager
-def _engine(args: argparse.Namespace) -> Iterator[tuple[Callable[[Run], Handle], int | None, str]]:
-    """How to start a run, how many at once, and that in words."""
+def _engine(
+    args: argparse.Namespace, runs: Sequence[Run]
+) -> Iterator[tuple[Callable[[Run, Environment], Handle], Sequence[Environment] | None, str]]:
+    """How to start a run, where those that go on at once are, and that in words."""
     if args.engine == "local":
-        from suite.runs.sweep import Process, default_jobs, share_of_memory
+        from suite.runs.places import places
+        from suite.runs.sweep import Process
 
-        jobs = args.jobs or default_jobs()
-        environment = share_of_memory(1 / jobs)
-        yield lambda run: Process(run.words, run.folder, args.retries, environment), jobs, f"{jobs} at once"
+        local = places(sum(run.status == "waiting" for run in runs), args.jobs, args.devices)
+        yield lambda run, place: Process(run.words, run.folder, args.retries, place), local, f"{len(local)} at once"
         return
 
     from suite.runs.sweep_ray import Cluster
 
     cluster = Cluster(args.address, args.gpus or 0, args.jobs, args.retries)
+    anywhere: list[Environment] | None = [{}] * args.jobs if args.jobs else None
     try:
-        yield cluster.start, args.jobs, f"on Ray (nodes: {cluster.nodes})"
+        yield lambda run, place: cluster.start(run), anywhere, f"on Ray (nodes: {cluster.nodes})"
     finally:
         cluster.close()
 

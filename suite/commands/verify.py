@@ -49,7 +49,7 @@ def _replayed(args: argparse.Namespace) -> list[str]:
     """Differences between the beginnings of runs and their records; prints each as it is found."""
     from leaderboards.publish import evidence_in
     from leaderboards.replay import replay
-    from suite.runs.sweep import default_jobs
+    from suite.runs.places import default_jobs
 
     problems, count = list[str](), 0
     standings, jobs = evidence_in(args.folder)[0], args.jobs or default_jobs(cores_each=1)

@@ -2,7 +2,7 @@
 
 Nothing starts before all of them are known to be right. Finished runs are left alone, and those that were stopped go
 on where they were, so that the same sweep again does what is missing. Where processes start is a function's business:
-`Process` is on this machine, `suite.runs.sweep_ray` on a cluster.
+`Process` is on this machine, in one of `suite.runs.places`; `suite.runs.sweep_ray` is on a cluster.
 """
 
 from __future__ import annotations
@@ -28,11 +28,10 @@ from suite import registry
 from suite.configuration.schema import Config
 from suite.records.record import RunRecord, require_writable, run_folder
 from suite.runs.devices import Asked
-from suite.runtime.compilation import device_kind
+from suite.runs.places import Environment
 from suite.runtime.errors import FolderInUseError, UserError
 from suite.runtime.signals import stop_signals
 
-CPUS_PER_RUN = 2
 PAUSE = 0.25  # seconds between two looks at the runs
 TAIL = 1 << 16  # bytes at the end of a file that are looked at
 RETRIES = 2  # of a run that died, unless the user says otherwise
@@ -170,8 +169,8 @@ def plan(
 
 def sweep(
     runs: Sequence[Run],
-    start: Callable[[Run], Handle],
-    jobs: int | None = None,
+    start: Callable[[Run, Environment], Handle],
+    places: Sequence[Environment] | None = None,
     show: Callable[[Sequence[Run], bool], None] = lambda runs, stopping: None,
 ) -> None:
     """Takes all runs that wait to their ends. Those that fail do not stop the others.
@@ -180,29 +179,31 @@ def sweep(
 
     Args:
       runs: their status and progress are kept up to date.
-      start: starts one.
-      jobs: how many go on at once; None: all, which is for those who have a queue of their own.
+      start: starts one, with what is to be in its environment besides ours.
+      places: the environments of those that go on at once; None: all do, for `start` has a queue of its own.
       show: called several times a second, with the runs and whether they were told to stop.
     """
     waiting = deque(run for run in runs if run.status == "waiting")
-    going: dict[Run, Handle] = {}
+    free = deque([Environment()] * len(waiting) if places is None else places)
+    going: dict[Run, tuple[Handle, Environment]] = {}
     told, signals = 0, list[int]()
     with stop_signals(signals.append):
         while going or (waiting and not signals):
-            while waiting and not signals and (jobs is None or len(going) < jobs):
-                run = waiting.popleft()
-                going[run] = start(run)
+            while waiting and free and not signals:
+                run, place = waiting.popleft(), free.popleft()
+                going[run] = start(run, place), place
             if told < len(signals):
                 told = len(signals)
-                for handle in going.values():
+                for handle, _ in going.values():
                     if told == 1:
                         handle.stop()
                     else:
                         handle.kill()
-            for run, handle in list(going.items()):
+            for run, (handle, place) in list(going.items()):
                 if outcome := handle.poll():
                     run.end(outcome)
                     del going[run]
+                    free.append(place)
                 else:
                     run.watch()
             show(runs, bool(signals))
@@ -221,7 +222,7 @@ class Process:
         words: Sequence[str],
         folder: Path,
         retries: int | None = None,
-        environment: Mapping[str, str] | None = None,
+        environment: Environment | None = None,
     ):
         """`words` as in `Run`; `environment` is beside ours."""
         self._words, self._folder, self._retries = words, folder, retries
@@ -296,19 +297,6 @@ class Process:
             self._next = now
             return None
         return Outcome("failed", f"died of {signal.Signals(-code).name}" if died else reason.removeprefix("error: "))
-
-
-def default_jobs(cores_each: int = CPUS_PER_RUN) -> int:
-    """How many runs this machine takes at once: one on an accelerator, or one for every two CPU cores or so many."""
-    if device_kind() != "cpu":
-        return 1
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // cores_each)
-
-
-def share_of_memory(share: float) -> dict[str, str]:
-    """The environment of runs that share one GPU, of which JAX otherwise takes three quarters for the first."""
-    return {"XLA_PYTHON_CLIENT_MEM_FRACTION": f"{0.9 * share:.2f}"} if share < 1 else {}
 
 
 def log_of(folder: Path) -> Path:

@@ -13,14 +13,15 @@ import os
 import socket
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import ray
 import ray.exceptions
 
-from suite.runs.sweep import CPUS_PER_RUN, PAUSE, RETRIES, Outcome, Process, Run, share_of_memory
+from suite.runs.places import CPUS_PER_RUN, Environment, share_of_memory
+from suite.runs.sweep import PAUSE, RETRIES, Outcome, Process, Run
 from suite.runtime.errors import UserError
 
 LOCAL = "local"  # Ray's word for: start one here
@@ -130,7 +131,7 @@ class _Task:
         ray.cancel(self._reference, force=True)
 
 
-def _work(words: Sequence[str], folder: Path, retries: int | None, environment: Mapping[str, str]) -> Outcome:
+def _work(words: Sequence[str], folder: Path, retries: int | None, environment: Environment) -> Outcome:
     """On a node, in the main thread of one of Ray's workers: `ray.cancel` comes as a KeyboardInterrupt."""
     process = Process(words, folder, retries, environment)
     while True:

@@ -8,14 +8,16 @@ import os
 import signal
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import jax
 import pytest
 from rich.console import Console
 
 from suite import cli
 from suite.commands import sweep as command
 from suite.records.record import RunRecord
-from suite.runs import sweep
+from suite.runs import places, sweep
 from suite.runs.sweep import Outcome, Process, log_of, plan
 from suite.runtime.errors import UserError
 from tests.runs.sweeping import (
@@ -188,6 +190,58 @@ def test_what_runs_ask_of_ray():
     for gpus, kind in {0: "float32", 0.5: "bfloat16"}.items():
         (run,) = plan("minatar/breakout", "m5", [0], "smoke", compute_types(gpus))
         assert (run.config.policy.compute_type, run.config.world_model.compute_type) == (kind, kind)
+
+
+# Where they go on.
+
+
+@pytest.mark.parametrize(
+    ("waiting", "jobs", "devices", "gpus", "share"),
+    [
+        (9, None, None, ["4", "5", "6", "7"], ""),
+        (2, None, None, ["4,5", "6,7"], ""),
+        (1, None, None, ["4,5,6,7"], ""),
+        (9, 3, None, ["4", "5", "6"], ""),
+        (9, 8, None, ["4", "5", "6", "7"] * 2, "0.45"),
+        (9, None, 2, ["4,5", "6,7"], ""),
+        (9, None, 3, ["4,5,6"], ""),
+        (9, None, "all", ["4,5,6,7"], ""),
+        (9, 2, "all", ["4,5,6,7"] * 2, "0.45"),
+    ],
+)
+def test_runs_have_gpus_of_their_own_while_there_are_enough(monkeypatch, waiting, jobs, devices, gpus, share):
+    monkeypatch.setattr(places, "device_kind", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_devices", lambda: [SimpleNamespace(local_hardware_id=n) for n in range(4, 8)])
+    found = places.places(waiting, jobs, devices)
+    # Which are variables that this JAX knows; what they hold is part of what CUDA_VISIBLE_DEVICES leaves.
+    assert {"jax_cuda_visible_devices", "jax_rocm_visible_devices"} <= set(jax.config.values)
+    for variable in ("JAX_CUDA_VISIBLE_DEVICES", "JAX_ROCM_VISIBLE_DEVICES"):
+        assert [place[variable] for place in found] == gpus
+    assert {place.get("XLA_PYTHON_CLIENT_MEM_FRACTION", "") for place in found} == {share}
+
+
+def test_a_run_that_ends_leaves_its_place_to_the_next(monkeypatch):
+    monkeypatch.setattr(sweep, "PAUSE", 0.0)
+    runs = plan("openspiel/tic_tac_toe", "random", range(5), "smoke")
+    began, going = [], set()
+
+    class Ends:
+        def __init__(self, run, place):
+            self.name, self.left = place["NAME"], 1 + run.config.seed % 3
+            assert self.name not in going
+            going.add(self.name)
+            began.append(self.name)
+
+        def poll(self):
+            self.left -= 1
+            if self.left:
+                return None
+            going.remove(self.name)
+            return Outcome("finished", result={"steps": 1, "seconds": 0.0, "scores": {}})
+
+    sweep.sweep(runs, Ends, [{"NAME": "a"}, {"NAME": "b"}])
+    assert {run.status for run in runs} == {"finished"} and not going
+    assert began[:2] == ["a", "b"] and set(began[2:]) == {"a", "b"}
 
 
 # What a run's process comes to. These are real processes, but no runs.
