@@ -76,7 +76,7 @@ def of_each_seed(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` of arrays with one more axis, the first, that of seeds: what it returns for each seed's arrays alone.
 
     Each device takes an equal share of seeds. On a CPU it takes one after the other, and gives what `function` itself
-    gives to the last bit. XLA's batched programs are slower there, by 1.7 times for `mfrl` (docs/performance.md), and
+    gives to the last bit. XLA's batched programs are slower there, by 1.7 times for `mfrl` (docs/speed.md), and
     round otherwise. An accelerator takes its share at once, since that fills it.
     """
 
