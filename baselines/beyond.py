@@ -31,6 +31,7 @@ GAMES_TRUST = 0.9
 TRUST_WINDOW = 10  # iterations; on Asterix there are some ten rewards in one
 EVENT_SHARE = 0.3  # more than that teaches more of rewards, but all else in larger and rarer steps
 PAID = 8  # as often as an action earns a reward in an episode, or oftener
+TOKEN_NOISE = 0.03  # two or three of a frame's 81 tokens
 
 # Each part of M6 by name: what it changes of M5.
 PARTS: dict[str, Part] = {
@@ -48,6 +49,7 @@ PARTS: dict[str, Part] = {
     "codes": lambda config: _finer_codes(config) if _task(config).light_changes else {},
     "events": lambda config: {"world_model.event_share": EVENT_SHARE} if _task(config).achievements else {},
     "paid": lambda config: {"world_model.paid": PAID} if _task(config).achievements else {},
+    "noise": lambda config: {"world_model.token_noise": TOKEN_NOISE} if _task(config).achievements else {},
     "trust": lambda config: {"imagination.trust": _trust(config), "imagination.trust_window": TRUST_WINDOW},
 }
 
@@ -55,12 +57,12 @@ PARTS: dict[str, Part] = {
 def m6(config: Config) -> Config:
     """M6: M5 with a world model that knows that most of a frame stands near its place in the frame before.
 
-    Fifteen parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an
+    Sixteen parts, which docs/agents.md explains: the correspondence head, positions in time, row and column, an
     embedding of the tokens around each one, in MinAtar the patches that codes stand for, the action added to every
     token, rewards and ends that are read off every token, the age of every token, another optimizer of the model, which
     in games of two players is slower and surer, dreams with averaged parameters and, in games of two players, without
-    improbable tokens, on Craftax a finer codebook, where achievements pay once an episode more lessons of what pays and
-    knowledge of what was paid, and no dreams while the model does not foresee rewards.
+    improbable tokens, on Craftax a finer codebook, where achievements pay once an episode more lessons of what pays,
+    knowledge of what was paid and wrong tokens to learn from, and no dreams while the model does not foresee rewards.
     """
     return _with_parts(config, PARTS)
 

@@ -47,6 +47,8 @@ LONGEST = (
     "test_contract.py",
     "runs/test_sweep.py",
     "runs/test_devices.py",
+    "runs/test_together.py",
+    "agent/test_seeds.py",
     "world_model/test_imagination.py",
     "test_gpu_script.py",
     "policy/test_ppo.py",

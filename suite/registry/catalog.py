@@ -313,6 +313,7 @@ AGENTS = (
             ("codes", "with the codebook of m5 on Craftax"),
             ("events", "that learns of Craftax's rewards as seldom as they come"),
             ("paid", "that does not know what a Craftax episode has paid already"),
+            ("noise", "whose world model reads only true frames of Craftax in training"),
             ("trust", "that dreams whatever its model knows of rewards"),
         )
     ),

@@ -190,6 +190,7 @@ M6 = {
     "codes": {"tokenizer.threshold": 0.5, "tokenizer.codebook_size": 8192},
     "events": {"world_model.event_share": 0.3},
     "paid": {"world_model.paid": 8},
+    "noise": {"world_model.token_noise": 0.03},
     "trust": {"imagination.trust": 0.5, "imagination.trust_window": 10},
 }
 
