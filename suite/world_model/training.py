@@ -17,6 +17,7 @@ from suite.interface.turns import CHANCE, Turn
 from suite.nn.masked import masked_mean
 from suite.nn.optimizer import clipped
 from suite.nn.per_device import of_each_device
+from suite.runtime import layout
 from suite.world_model.correspondence import mixture_loss
 from suite.world_model.heads import TurnLogits
 from suite.world_model.sequences import Sequences
@@ -181,14 +182,16 @@ def losses(
 
 
 def with_wrong_tokens(frame_BFL: jax.Array, share: float, key: jax.Array) -> jax.Array:
-    """Frames of which a share of all tokens is that of the same place in some other sequence.
+    """Frames of which a share of all tokens is that of the same place in a sequence of the batch, or its own by chance.
 
     A dreamt frame is wrong at times: its tokens are drawn at each place by itself, so that a ball may be drawn nowhere.
     A model that has read true frames alone does not know how to go on from there, and what it says of rewards and ends
     is arbitrary. What it has to predict stays true, so it learns to rely on the frames before.
     """
     order_key, which_key = jax.random.split(key)
-    other_BFL = jax.random.permutation(order_key, frame_BFL, axis=0)
+    batch, frames = frame_BFL.shape[:2]
+    order_B = jax.random.permutation(order_key, batch)
+    other_BFL = layout.take(frame_BFL, order_B, jnp.broadcast_to(jnp.arange(frames), (batch, frames)))
     wrong_BFL = jax.random.bernoulli(which_key, share, frame_BFL.shape[:3])
     return jnp.where(wrong_BFL.reshape(*wrong_BFL.shape, *(1,) * (frame_BFL.ndim - 3)), other_BFL, frame_BFL)
 
