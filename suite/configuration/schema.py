@@ -161,8 +161,9 @@ class WorldModelConfig:
     # This share of the training sequences is drawn among those in which a reward is paid or an episode ends. The losses
     # of rewards and ends are weighed so that they stay what they are on average. 0: all are drawn alike.
     event_share: Rate = 0.0
-    # In training each token that is read is, with this probability, that of the same place in another sequence: the
-    # model learns to go on from frames that are wrong, as those of dreams are at times. 0: all are as they were.
+    # In training each token that is read is, with this probability, that of the same place in another sequence of the
+    # minibatch (or, since their order is random, in its own): the model learns to go on from frames that are wrong, as
+    # those of dreams are at times. 0: all are as they were.
     token_noise: Rate = 0.0
     updates: NotNegative = 500  # N_TWM
     minibatches: Positive = 3
