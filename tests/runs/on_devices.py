@@ -29,7 +29,8 @@ SIZES = {
 CERTAIN_DREAMS = {"imagination.trust": 0, "imagination.trust_window": 0}  # m6 dreams however little it knows
 # A VQ-VAE of whole frames learns chaotically (docs/scoring.md): its updates make what sums are rounded by larger. Its
 # frames are whole gray levels: of 50,000 pixels one gets another level, and that moves a value by up to 1e-3. So its
-# updates are small, and the policy sees few of its pixels.
+# updates are small, and the policy sees few of its pixels; with 16 x 16 none is in the way on our processors, on others
+# one may be.
 STEADY = {"tokenizer.learning_rate": 1e-6, "policy.max_pixels": 16}
 STEPS = 384  # two iterations of 16 x 12
 SHARED = 2
